@@ -65,20 +65,24 @@ impl Administrator {
         Ok(Self { token: token.to_owned(), sender: requests(stream).await? })
     }
 
-    /// Sends a request that must succeed; returns the body of the answer.
+    /// Sends a request that must succeed, with a further header; returns the body of the answer.
     pub async fn bytes(
         &mut self,
         method: Method,
         path: &str,
+        header: Option<(&'static str, String)>,
         body: Vec<u8>,
     ) -> Result<Bytes, String> {
-        let request = Request::builder()
+        let mut request = Request::builder()
             .method(method)
             .uri(path)
             .header("host", "cloud")
-            .header("authorization", format!("Bearer {}", self.token))
-            .body(Full::new(Bytes::from(body)))
-            .map_err(|error| error.to_string())?;
+            .header("authorization", format!("Bearer {}", self.token));
+        if let Some((name, value)) = header {
+            request = request.header(name, value);
+        }
+        let request =
+            request.body(Full::new(Bytes::from(body))).map_err(|error| error.to_string())?;
         let (status, body) = answer(&mut self.sender, request).await?;
         match status.is_success() {
             true => Ok(body),
@@ -94,7 +98,13 @@ impl Administrator {
         body: &impl Serialize,
     ) -> Result<T, String> {
         let body = serde_json::to_vec(body).map_err(|error| error.to_string())?;
-        let answer = self.bytes(method, path, body).await?;
+        let answer = self.bytes(method, path, None, body).await?;
+        serde_json::from_slice(&answer).map_err(|error| format!("{path}: {error}"))
+    }
+
+    /// Reads an answer of JSON.
+    pub async fn get<T: DeserializeOwned>(&mut self, path: &str) -> Result<T, String> {
+        let answer = self.bytes(Method::GET, path, None, Vec::new()).await?;
         serde_json::from_slice(&answer).map_err(|error| format!("{path}: {error}"))
     }
 

@@ -1,4 +1,4 @@
-//! The cloud is killed again and again under a fleet that sends records.
+//! The cloud is killed again and again under a fleet that sends records and gets releases in waves.
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
@@ -15,6 +15,7 @@ use crate::administrator::Administrator;
 use crate::figure::{FleetFigure, quantile};
 use crate::fleet::{EnrolledFleet, enrol_all, start_all};
 use crate::identity::SimulatedIdentity;
+use crate::rollouts::Rollouts;
 use crate::simulation::{FleetLoad, Simulation};
 
 /// Longest pause between attempts to connect. Real vehicles wait up to five minutes, and would be
@@ -63,6 +64,7 @@ pub async fn figures(
     }
     simulation.load.send_replace(FleetLoad { interval: Some(INTERVAL), records: RECORDS });
     simulation.is_restarting.store(true, Relaxed);
+    let rollouts = Rollouts::start(fleet.cloud.people, &fleet.token, count);
     for _ in 0..kills {
         sleep(interval).await;
         fleet.cloud.kill();
@@ -71,7 +73,7 @@ pub async fn figures(
     let EnrolledFleet { cloud, token, vehicles: identities, .. } = &fleet;
     let members = FleetMembers { people: cloud.people, token, identities };
     let mut figures = vec![FleetFigure::free("kills: number of kills", "", kills as f64)];
-    figures.extend(finish(&simulation, vehicles, &members).await?);
+    figures.extend(finish(&simulation, vehicles, rollouts, &members).await?);
     figures.iter().for_each(|figure| println!("{figure}"));
     Ok(figures)
 }
@@ -91,10 +93,11 @@ pub async fn figures_of(
     }
     simulation.load.send_replace(FleetLoad { interval: Some(INTERVAL), records: RECORDS });
     simulation.is_restarting.store(true, Relaxed);
+    let rollouts = Rollouts::start(running.people, &token, count);
     println!("all vehicles are connected");
     sleep(time).await;
     let members = FleetMembers { people: running.people, token: &token, identities: &identities };
-    let figures = finish(&simulation, vehicles, &members).await?;
+    let figures = finish(&simulation, vehicles, rollouts, &members).await?;
     figures.iter().for_each(|figure| println!("{figure}"));
     Ok(figures)
 }
@@ -103,6 +106,7 @@ pub async fn figures_of(
 async fn finish(
     simulation: &Arc<Simulation>,
     mut vehicles: JoinSet<()>,
+    rollouts: Rollouts,
     members: &FleetMembers<'_>,
 ) -> Result<Vec<FleetFigure>, String> {
     let count = members.identities.len();
@@ -110,6 +114,7 @@ async fn finish(
     let after = simulation.until(PATIENCE, all).await;
     let after = after.map_or(f64::INFINITY, |it| it.as_secs_f64());
     simulation.is_restarting.store(false, Relaxed);
+    let rollouts = rollouts.finish().await?;
     sleep(Duration::from_secs(3)).await;
     simulation.load.send_replace(FleetLoad::default());
     sleep(Duration::from_secs(3)).await;
@@ -117,6 +122,12 @@ async fn finish(
     while vehicles.join_next().await.is_some() {}
     let sent = simulation.take_acknowledged_ms().len() as f64 * RECORDS as f64;
     let stored = stored(members, simulation).await?;
+
+    let mut administrator = Administrator::connect(members.people, members.token).await?;
+    let wrong_steps = rollouts.wrong_steps(&mut administrator).await?;
+    let names = members.identities.iter().map(|it| &it.name);
+    let wrong_of = |name: &String| rollouts.wrong_releases(&simulation.told_to(name));
+    let wrong_releases = names.map(wrong_of).sum::<usize>() as f64;
 
     let reconnected = simulation.take_reconnected_s();
     let mut figures = vec![
@@ -126,6 +137,16 @@ async fn finish(
         FleetFigure::at_most("kills: records lost, or stored twice", "", 0.0, simulation.losses()),
         FleetFigure::at_most("kills: all connected after the last one", "s", 30.0, after),
     ];
+    figures.extend([
+        FleetFigure::free("kills: rollout steps", "", rollouts.steps.len() as f64),
+        FleetFigure::at_most("kills: rollout steps taken twice or missed", "", 0.0, wrong_steps),
+        FleetFigure::at_most(
+            "kills: releases that a vehicle got twice or not",
+            "",
+            0.0,
+            wrong_releases,
+        ),
+    ]);
     for (name, share) in [("p50", 0.5), ("p99", 0.99), ("max", 1.0)] {
         let name = format!("kills: time without a connection, {name}");
         figures.push(FleetFigure::free(&name, "s", quantile(&reconnected, share)));
@@ -141,7 +162,7 @@ async fn stored(members: &FleetMembers<'_>, simulation: &Simulation) -> Result<f
     let mut all = 0;
     for vehicle in members.identities {
         let path = format!("/v1/vehicles/{}/events", vehicle.name);
-        let lines = administrator.bytes(Method::GET, &path, Vec::new()).await?;
+        let lines = administrator.bytes(Method::GET, &path, None, Vec::new()).await?;
         let mut times = BTreeMap::<u64, u64>::new();
         for line in lines.split(|byte| *byte == b'\n').filter(|line| !line.is_empty()) {
             let line: StoredLine =

@@ -5,14 +5,12 @@ use std::sync::atomic::Ordering::Relaxed;
 use std::time::Duration;
 
 use gleaner_fleet::people::{FleetDeployment, ListPage};
-use gleaner_trust::{Deployment, Grants, Revision, RevisionFile, SecretKey, seal, sha256};
 use hyper::Method;
-use serde_json::{Value, json};
 use tokio::time::{Instant, sleep, timeout};
 
-use crate::administrator::Administrator;
 use crate::figure::{FleetFigure, quantile};
 use crate::fleet::EnrolledFleet;
+use crate::release::SignedRelease;
 use crate::simulation::FleetLoad;
 use crate::vehicle::{be_silent, open};
 
@@ -107,7 +105,7 @@ pub async fn figures(count: usize, times: &LoadTimes) -> Result<Vec<FleetFigure>
     let cpu_s = cloud.cpu_s();
     let release = simulation.begun.elapsed().as_secs() + 1;
     simulation.await_release(release);
-    deploy(&mut administrator, release).await?;
+    SignedRelease::new(release, None)?.deploy(&mut administrator).await?;
     let most = count * 99 / 100;
     simulation.until(PATIENCE, |it| it.applied_s().len() >= most).await;
     let applied = simulation.applied_s();
@@ -121,10 +119,8 @@ pub async fn figures(count: usize, times: &LoadTimes) -> Result<Vec<FleetFigure>
     // The cloud closes connections without a request.
     let mut administrator = fleet.administrator().await?;
     let begun = Instant::now();
-    let all = administrator.bytes(Method::GET, "/v1/deployments", Vec::new()).await?;
+    let all: ListPage<FleetDeployment> = administrator.get("/v1/deployments").await?;
     add(FleetFigure::free("list of deployments", "s", begun.elapsed().as_secs_f64()));
-    let all: ListPage<FleetDeployment> =
-        serde_json::from_slice(&all).map_err(|error| error.to_string())?;
     if all.items.first().map(|it| it.running) != Some(count as u64) {
         simulation.error(format!("of {count} vehicles, these run it: {all:?}"));
     }
@@ -133,7 +129,7 @@ pub async fn figures(count: usize, times: &LoadTimes) -> Result<Vec<FleetFigure>
     let (mut socket, _) = open(revoked, &simulation).await?;
     let begun = Instant::now();
     let path = format!("/v1/vehicles/{}", revoked.name);
-    administrator.bytes(Method::DELETE, &path, Vec::new()).await?;
+    administrator.bytes(Method::DELETE, &path, None, Vec::new()).await?;
     let ended =
         async { while let Some(Ok(_)) = futures_util::StreamExt::next(&mut socket).await {} };
     let cut_s =
@@ -149,47 +145,4 @@ pub async fn figures(count: usize, times: &LoadTimes) -> Result<Vec<FleetFigure>
     }
     add(FleetFigure::at_most("errors", "", 0.0, simulation.errors() + simulation.losses()));
     Ok(figures)
-}
-
-/// Deploys a lambda of one file to the whole fleet.
-async fn deploy(administrator: &mut Administrator, release: u64) -> Result<(), String> {
-    let failed = |error: &dyn std::fmt::Display| error.to_string();
-    let file = b"content of a lambda";
-    let key = SecretKey::generate().map_err(|error| failed(&error))?;
-    let revision = Revision {
-        name: "brake-dark".parse().map_err(|error| failed(&error))?,
-        version: "1.0.0".parse().map_err(|error| failed(&error))?,
-        kind: serde_json::from_value(json!("wasm")).map_err(|error| failed(&error))?,
-        release,
-        created: 1,
-        files: vec![RevisionFile {
-            path: "lambda.toml".parse().map_err(|error| failed(&error))?,
-            bytes: file.len() as u64,
-            sha256: sha256(file),
-        }],
-    };
-    let digest = serde_json::to_vec(&revision).map_err(|error| failed(&error))?;
-    let selector = "fleet".parse().map_err(|error| failed(&error))?;
-    let deployment = Deployment {
-        id: "brake-dark".parse().map_err(|error| failed(&error))?,
-        release,
-        selector: [(selector, "simulated".to_owned())].into(),
-        revision: sha256(&digest),
-        fallback: None,
-        config: [].into(),
-        grants: Grants::default(),
-        created: 1,
-        expires: 2,
-    };
-    let sealed = seal(&deployment, &[&key]).map_err(|error| failed(&error))?;
-    let revision = seal(&revision, &[&key]).map_err(|error| failed(&error))?;
-    let text = |envelope: &[u8]| String::from_utf8_lossy(envelope).into_owned();
-    let request = json!({ "deployment": text(&sealed), "revisions": [text(&revision)] });
-    let reply: Value = administrator.call(Method::POST, "/v1/deployments", &request).await?;
-    if reply["result"] == "missing" {
-        let path = format!("/v1/objects/{}", sha256(file));
-        administrator.bytes(Method::PUT, &path, file.to_vec()).await?;
-        let _: Value = administrator.call(Method::POST, "/v1/deployments", &request).await?;
-    }
-    Ok(())
 }

@@ -5,6 +5,7 @@
 //!   TLS, and runs nothing. `simulation` is the state that all of them share.
 //! - `cloud_process` starts and measures the real `gleaner-cloud`, `administrator` is its user, and
 //!   `fleet` has both with the vehicles.
+//! - `release` is what people deploy, and `rollouts` deploys it in waves, one after the other.
 //! - `load` measures a fleet that connects, is idle and is active; `chaos` kills the cloud.
 
 mod administrator;
@@ -14,6 +15,8 @@ mod figure;
 mod fleet;
 mod identity;
 mod load;
+mod release;
+mod rollouts;
 mod simulation;
 mod vehicle;
 

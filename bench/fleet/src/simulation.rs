@@ -48,6 +48,8 @@ pub struct Simulation {
     ends: Mutex<HashMap<String, u64>>,
     reconnected_s: Mutex<Vec<f64>>,
     applied_s: Mutex<(Option<Instant>, Vec<f64>)>,
+    /// The envelopes that a vehicle was told to run, one after the other; empty for none.
+    told: Mutex<HashMap<String, Vec<String>>>,
 }
 
 #[derive(Default)]
@@ -82,6 +84,7 @@ impl Simulation {
             ends: Mutex::default(),
             reconnected_s: Mutex::default(),
             applied_s: Mutex::default(),
+            told: Mutex::default(),
         }
     }
 
@@ -116,6 +119,20 @@ impl Simulation {
     /// Returns the number after the last acknowledged record of a vehicle.
     pub fn end_of(&self, vehicle: &str) -> u64 {
         lock(&self.ends).get(vehicle).copied().unwrap_or(0)
+    }
+
+    /// Notes the envelope that a vehicle is told to run; empty for none.
+    pub fn told(&self, vehicle: &str, envelope: &str) {
+        let mut told = lock(&self.told);
+        let of_vehicle = told.entry(vehicle.to_owned()).or_default();
+        if of_vehicle.last().map_or("", |last| last) != envelope {
+            of_vehicle.push(envelope.to_owned());
+        }
+    }
+
+    /// Returns the different envelopes that a vehicle was told to run, one after the other.
+    pub fn told_to(&self, vehicle: &str) -> Vec<String> {
+        lock(&self.told).get(vehicle).cloned().unwrap_or_default()
     }
 
     /// Notes the time from the end of a connection to the next one.

@@ -47,9 +47,12 @@ pub struct SimulatedVehicle {
     waiting: Option<(u64, Instant)>,
     /// Each deployment that runs: id, envelope, release and digest of its revision.
     runs: Vec<RunningRelease>,
+    /// Numbers of the last wanted state, and of the one that was applied.
+    told: u64,
     handled: u64,
 }
 
+#[derive(Clone)]
 struct RunningRelease {
     id: String,
     envelope: String,
@@ -61,7 +64,8 @@ impl SimulatedVehicle {
     pub fn new(identity: SimulatedIdentity, simulation: Arc<Simulation>) -> Self {
         let load = simulation.load.subscribe();
         let (next, acknowledged, waiting) = (0, 0, None);
-        Self { identity, simulation, load, next, acknowledged, waiting, runs: vec![], handled: 0 }
+        let (runs, told, handled) = (vec![], 0, 0);
+        Self { identity, simulation, load, next, acknowledged, waiting, runs, told, handled }
     }
 
     /// Keeps a connection for as long as the bench runs, and pauses after each end as a real
@@ -189,12 +193,19 @@ impl SimulatedVehicle {
     /// do, and reports that they run. Nothing is verified and nothing starts.
     async fn apply(&mut self, socket: &mut Socket, desired: Desired) -> Result<(), String> {
         let simulation = Arc::clone(&self.simulation);
+        let Desired { generation, deployments } = desired;
+        if generation < self.told {
+            let Self { identity, told, .. } = self;
+            simulation.error(format!("{}: wanted state {generation} after {told}", identity.name));
+        }
+        self.told = generation;
+        let wanted: Vec<_> = deployments.into_iter().filter(|it| it.is_wanted).collect();
+        simulation.told(&self.identity.name, wanted.first().map_or("", |it| &it.envelope));
         let turn = simulation.files.acquire().await.map_err(|error| error.to_string())?;
         let (mut runs, mut files) = (Vec::new(), None);
-        for Wanted { id, envelope, .. } in desired.deployments.into_iter().filter(|it| it.is_wanted)
-        {
-            if let Some(same) = self.runs.iter().position(|it| it.envelope == envelope) {
-                runs.push(self.runs.swap_remove(same));
+        for Wanted { id, envelope, .. } in wanted {
+            if let Some(same) = self.runs.iter().find(|it| it.envelope == envelope) {
+                runs.push(same.clone());
                 continue;
             }
             let address = self.simulation.address;
@@ -211,7 +222,7 @@ impl SimulatedVehicle {
             runs.push(RunningRelease { id, envelope, release, revision });
         }
         drop((files, turn));
-        (self.runs, self.handled) = (runs, desired.generation);
+        (self.runs, self.handled) = (runs, generation);
         self.report(socket).await?;
         send(socket, Body::Ping(Ping { number: SETTLE })).await
     }

@@ -78,7 +78,8 @@ impl Entrance {
     /// Accepts connections until the server stops, and then waits for the open ones.
     pub(crate) async fn serve(self) {
         let Self { listener, router, tls, most, most_of_one, is_behind_proxy, mut stop } = self;
-        let clients = OpenClients::new(most_of_one);
+        let things = if tls.is_some() { "vehicle connections" } else { "people connections" };
+        let clients = OpenClients::new(things, most_of_one);
         let mut number = 0;
         let slots = Arc::new(Semaphore::new(most as usize));
         let handshakes = Arc::new(Semaphore::new(HANDSHAKES));
@@ -102,12 +103,9 @@ impl Entrance {
                 }
             };
             number += 1;
-            let Some(client) = clients.open(address.ip(), number) else {
-                tracing::warn!(most_of_one, "a connection is refused: its network has too many");
-                continue;
-            };
+            let Some(client) = clients.open(address.ip(), number) else { continue };
             let Some(slot) = free_slot(&slots, &clients).await else {
-                tracing::warn!(most, "a connection is refused: too many are open");
+                clients.refused();
                 continue;
             };
             let tls = tls.as_ref().map(|tls| Handshake {

@@ -139,6 +139,12 @@ impl BusAddress {
 }
 
 impl Bus {
+    /// Creates the sending side over a queue.
+    #[cfg(test)]
+    pub(crate) fn of_queue(queue: mpsc::Sender<Hint>) -> Self {
+        Self { queue: Some(queue), dropped: AtomicU64::new(0) }
+    }
+
     /// Sends a hint about vehicles.
     pub(crate) fn changed(&self, names: &[String]) {
         for names in names.chunks(NAMES_MAX) {
@@ -274,7 +280,7 @@ mod tests {
     #[tokio::test]
     async fn hints_that_nothing_sends_are_dropped() {
         let (queue, _waiting) = mpsc::channel(1);
-        let bus = Bus { queue: Some(queue), dropped: AtomicU64::new(0) };
+        let bus = Bus::of_queue(queue);
         let names: Vec<_> = (0..3 * NAMES_MAX).map(|it| it.to_string()).collect();
         bus.changed(&names);
         assert_eq!(bus.dropped.load(Ordering::Relaxed), 2, "of three messages, one has room");

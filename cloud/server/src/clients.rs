@@ -9,6 +9,8 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use axum::http::HeaderMap;
 use tokio::sync::Notify;
 
+use crate::bounds::BoundCounts;
+
 /// The network of a client: an IPv4 address, or the first 64 bits of an IPv6 address, of which
 /// one client can have all.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -40,6 +42,7 @@ pub(crate) struct OpenClients {
     /// Maximum number of one network. A proxy on this machine has the connections of many clients.
     most_of_one: usize,
     all: Mutex<ConnectionsOfAll>,
+    counts: BoundCounts,
 }
 
 type ConnectionsOfAll = HashMap<ClientNetwork, BTreeMap<u64, Arc<ClientState>>>;
@@ -58,8 +61,9 @@ impl ClientState {
 }
 
 impl OpenClients {
-    pub(crate) fn new(most_of_one: u32) -> Arc<Self> {
-        Arc::new(Self { most_of_one: most_of_one as usize, all: Mutex::default() })
+    pub(crate) fn new(things: &'static str, most_of_one: u32) -> Arc<Self> {
+        let (all, counts) = (Mutex::default(), BoundCounts::of(things));
+        Arc::new(Self { most_of_one: most_of_one as usize, all, counts })
     }
 
     /// Counts a connection, the `number`th one. At the bound of its network, the oldest one without
@@ -69,7 +73,8 @@ impl OpenClients {
         let mut all = self.lock();
         let of_network = all.entry(network).or_default();
         let is_full = of_network.len() >= self.most_of_one && !network.0.is_loopback();
-        if is_full && !end_oldest_idle(of_network) {
+        if is_full && !self.end_oldest_idle(of_network) {
+            self.counts.refused();
             return None;
         }
         let state = Arc::new(ClientState::default());
@@ -82,18 +87,27 @@ impl OpenClients {
     pub(crate) fn end_one(&self) -> bool {
         let mut all = self.lock();
         let with_idle = all.values_mut().filter(|it| it.values().any(|it| it.is_idle()));
-        with_idle.max_by_key(|it| it.len()).is_some_and(end_oldest_idle)
+        with_idle.max_by_key(|it| it.len()).is_some_and(|it| self.end_oldest_idle(it))
+    }
+
+    /// Counts a connection that was refused, as all places are taken.
+    pub(crate) fn refused(&self) {
+        self.counts.refused();
+    }
+
+    fn end_oldest_idle(&self, of_network: &mut BTreeMap<u64, Arc<ClientState>>) -> bool {
+        let oldest = of_network.iter().find(|(_, it)| it.is_idle()).map(|(number, _)| *number);
+        let Some(ended) = oldest.and_then(|number| of_network.remove(&number)) else {
+            return false;
+        };
+        ended.end.notify_one();
+        self.counts.ended();
+        true
     }
 
     fn lock(&self) -> MutexGuard<'_, ConnectionsOfAll> {
         self.all.lock().unwrap_or_else(PoisonError::into_inner)
     }
-}
-
-fn end_oldest_idle(of_network: &mut BTreeMap<u64, Arc<ClientState>>) -> bool {
-    let oldest = of_network.iter().find(|(_, it)| it.is_idle()).map(|(number, _)| *number);
-    let ended = oldest.and_then(|number| of_network.remove(&number));
-    ended.inspect(|it| it.end.notify_one()).is_some()
 }
 
 /// An open connection, until it is dropped.
@@ -151,7 +165,7 @@ mod tests {
 
     #[test]
     fn a_network_ends_its_own_idle_connections_and_has_a_bound() {
-        let clients = OpenClients::new(2);
+        let clients = OpenClients::new("connections", 2);
         let open = |text: &str, number| clients.open(address(text), number);
         let [one, _two] = [1, 2].map(|number| open("10.0.0.1", number).unwrap());
         one.begin_request();
@@ -159,6 +173,7 @@ mod tests {
         let three = open("10.0.0.1", 3).unwrap();
         three.begin_request();
         assert!(open("10.0.0.1", 4).is_none(), "both have requests");
+        assert_eq!(clients.counts.numbers(), (1, 1));
         assert!(open("10.0.0.2", 5).is_some(), "another network is not in question");
         one.end_request();
         assert!(open("::ffff:10.0.0.1", 6).is_some(), "the same address");
@@ -172,13 +187,14 @@ mod tests {
 
     #[test]
     fn with_all_places_taken_the_network_with_the_most_gives_one() {
-        let clients = OpenClients::new(10);
+        let clients = OpenClients::new("connections", 10);
         let many: Vec<_> = (0..3).map(|it| clients.open(address("10.0.0.1"), it)).collect();
         let _one = clients.open(address("10.0.0.2"), 3).unwrap();
         assert!((0..2).all(|_| clients.end_one()));
         assert!(many.iter().flatten().all(OpenClient::is_idle));
         assert_eq!(clients.lock()[&ClientNetwork::of(address("10.0.0.2"))].len(), 1);
         assert!(clients.end_one() && clients.end_one() && !clients.end_one());
+        assert_eq!(clients.counts.numbers(), (4, 0));
     }
 
     #[test]

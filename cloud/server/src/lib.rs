@@ -19,6 +19,7 @@
 mod accept;
 mod attempts;
 mod authority;
+mod bounds;
 mod bus;
 mod clients;
 mod clips;

@@ -8,6 +8,7 @@ use gleaner_fleet::people::{Role, User};
 use tokio::sync::watch;
 use tokio::time::{Instant, sleep_until};
 
+use crate::bounds::BoundCounts;
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 
@@ -19,8 +20,10 @@ const OF_USER_MAX: usize = 16;
 const LOOK: Duration = Duration::from_millis(if cfg!(test) { 20 } else { 2000 });
 
 /// The streams that are being read.
-#[derive(Default)]
-pub(crate) struct Readers(Mutex<HashMap<String, OpenReaders>>);
+pub(crate) struct Readers {
+    open: Mutex<HashMap<String, OpenReaders>>,
+    counts: BoundCounts,
+}
 
 struct OpenReaders {
     count: usize,
@@ -35,6 +38,11 @@ pub(crate) struct ReaderSlot {
 }
 
 impl Readers {
+    /// Creates the bound of streams or pages, which the log has under the name `things`.
+    pub(crate) fn new(things: &'static str) -> Arc<Self> {
+        Arc::new(Self { open: Mutex::default(), counts: BoundCounts::of(things) })
+    }
+
     /// Begins to read a stream for a user.
     ///
     /// # Errors
@@ -42,8 +50,10 @@ impl Readers {
     /// An error if too many are read already.
     pub(crate) fn open(self: &Arc<Self>, user: &str) -> CloudResult<ReaderSlot> {
         let mut all = self.lock();
-        let busy =
-            |message| CloudError::busy(message, "end another `gleaner logs -f`, or close a page");
+        let busy = |message| {
+            self.counts.refused();
+            CloudError::busy(message, "end another `gleaner logs -f`, or close a page")
+        };
         if all.values().map(|it| it.count).sum::<usize>() >= READERS_MAX {
             return Err(busy("too many streams are read already"));
         }
@@ -66,7 +76,7 @@ impl Readers {
     }
 
     fn lock(&self) -> MutexGuard<'_, HashMap<String, OpenReaders>> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        self.open.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -140,7 +150,7 @@ mod tests {
 
     #[tokio::test]
     async fn streams_are_bounded_for_each_user_and_end_with_the_user() {
-        let readers = Arc::new(Readers::default());
+        let readers = Readers::new("streams");
         let mut of_ann: Vec<_> = (0..OF_USER_MAX).map(|_| readers.open("ann").unwrap()).collect();
         assert!(readers.open("ann").is_err());
         let _of_bob = readers.open("bob").unwrap();
@@ -150,5 +160,6 @@ mod tests {
         assert!(readers.open("ann").is_ok());
         let more: Vec<_> = (0..READERS_MAX).map(|user| readers.open(&user.to_string())).collect();
         assert_eq!(more.iter().filter(|it| it.is_ok()).count(), READERS_MAX - OF_USER_MAX);
+        assert_eq!(readers.counts.numbers(), (0, 1 + OF_USER_MAX as u64));
     }
 }

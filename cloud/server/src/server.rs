@@ -21,6 +21,7 @@ use crate::folder::{DataFolder, FolderLock};
 use crate::hub::Hub;
 use crate::objects::Objects;
 use crate::place::FilePlace;
+use crate::readers::Readers;
 use crate::records::ChunkFiles;
 use crate::s3::S3Bucket;
 use crate::store::{ClipBounds, CloudStore, Retention};
@@ -169,8 +170,8 @@ impl CloudServer {
             wrong_secrets: WrongSecrets::default(),
             limits: VehicleLimits::default(),
             account_changes: AccountChanges::default(),
-            readers: Arc::default(),
-            page_readers: Arc::default(),
+            readers: Readers::new("streams of records"),
+            page_readers: Readers::new("pages of records"),
             tails: Arc::default(),
             stored_frames: Semaphore::new(STORED_FRAMES_MAX),
             retention: Retention::DEFAULT,

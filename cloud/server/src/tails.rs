@@ -128,7 +128,42 @@ pub(crate) async fn deliver(cloud: &Cloud) -> CloudResult<()> {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Instant;
+
+    use tempfile::TempDir;
+    use tokio::sync::mpsc;
+
     use super::*;
+    use crate::bus::Bus;
+    use crate::hub::Hub;
+
+    #[tokio::test]
+    async fn however_many_readers_come_leases_are_stored_a_few_times_in_a_second() {
+        let folder = TempDir::new().unwrap();
+        let mut cloud = crate::people::tests::cloud(&folder).await;
+        let (queue, mut hints) = mpsc::channel(1000);
+        Arc::get_mut(&mut cloud).unwrap().hub = Hub::new(Bus::of_queue(queue));
+        let begun = Instant::now();
+        let readers = async {
+            let mut readers = Vec::new();
+            loop {
+                readers.push(cloud.tails.read("car-7", &["events".to_owned()]));
+                sleep(Duration::from_millis(1)).await;
+            }
+        };
+        // Each time that leases of new readers are stored, other replicas get a hint.
+        let stored = async {
+            for _ in 0..4 {
+                hints.recv().await.unwrap();
+            }
+        };
+        tokio::select! {
+            () = stored => {}
+            () = keep(&cloud) => {}
+            () = readers => {}
+        }
+        assert!(begun.elapsed() >= 3 * PAUSE, "{:?}", begun.elapsed());
+    }
 
     #[test]
     fn a_stream_is_read_until_its_last_reader_ends() {

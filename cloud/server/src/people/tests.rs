@@ -15,6 +15,7 @@ use crate::folder::DataFolder;
 use crate::hub::Hub;
 use crate::objects::Objects;
 use crate::place::FilePlace;
+use crate::readers::Readers;
 use crate::records::ChunkFiles;
 use crate::store::{ClipBounds, CloudStore, Retention};
 use serde_json::{Value, json};
@@ -34,9 +35,9 @@ pub(crate) async fn cloud(folder: &TempDir) -> Arc<Cloud> {
         wrong_secrets: WrongSecrets::default(),
         limits: VehicleLimits::default(),
         account_changes: AccountChanges::default(),
-        readers: Arc::default(),
+        readers: Readers::new("streams of records"),
         tails: Arc::default(),
-        page_readers: Arc::default(),
+        page_readers: Readers::new("pages of records"),
         stored_frames: Semaphore::new(4),
         retention: Retention::DEFAULT,
         keep_records_days: 30,
@@ -73,11 +74,15 @@ async fn send(
     for (name, value) in headers {
         request = request.header(*name, *value);
     }
-    let router = TowerToHyperService::new(router(cloud));
-    let reply = router.call(request.body(body.into()).unwrap()).await.unwrap();
+    let reply = answer(cloud, request.body(body.into()).unwrap()).await;
     let (parts, body) = reply.into_parts();
     let body = to_bytes(body, BODY_MAX).await.unwrap().to_vec();
     ApiAnswer { status: parts.status, headers: parts.headers, body }
+}
+
+/// Returns an answer whose body may last.
+async fn answer(cloud: &Arc<Cloud>, request: Request<Body>) -> Response {
+    TowerToHyperService::new(router(cloud)).call(request).await.unwrap()
 }
 
 async fn status_of(
@@ -97,6 +102,7 @@ async fn token_of(cloud: &Cloud, name: &str, role: Role) -> String {
 }
 
 mod conditions;
+mod gaps;
 mod openapi;
 mod ranges;
 

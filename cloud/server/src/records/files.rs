@@ -58,18 +58,24 @@ impl ChunkFiles {
     }
 }
 
+/// What is read of a chunk.
+pub(super) enum ChunkContent {
+    Lines(Vec<KeptLine>),
+    /// The line in the place of one whose file cannot be used, with the reason.
+    Damaged(KeptLine),
+}
+
 impl Cloud {
-    /// Returns the lines of a chunk: a single one with the reason if its file cannot be used.
-    /// `None` if the chunk was removed meanwhile.
+    /// Reads a chunk. `None` if it was removed meanwhile.
     ///
     /// # Errors
     ///
     /// An error if the place of the files cannot be reached: then nothing is known of the file.
-    pub(super) async fn chunk_lines(
+    pub(super) async fn chunk_content(
         &self,
         of: (&str, &str),
         stored: &StoredChunk,
-    ) -> CloudResult<Option<Vec<KeptLine>>> {
+    ) -> CloudResult<Option<ChunkContent>> {
         let StoredChunk { sha256, stored_bytes, .. } = stored;
         let file = self.chunks.content(sha256, *stored_bytes).await.map_err(unreachable)?;
         let lines = match file {
@@ -81,7 +87,7 @@ impl Cloud {
             }
         };
         match lines {
-            Ok(lines) => Ok(Some(lines)),
+            Ok(lines) => Ok(Some(ChunkContent::Lines(lines))),
             Err(_) if !self.store.has_chunk(of, stored).await? => Ok(None),
             Err(reason) => {
                 tracing::error!(
@@ -91,7 +97,7 @@ impl Cloud {
                     reason,
                     "a chunk of records cannot be used"
                 );
-                Ok(Some(vec![chunk::damaged(of.1, stored, &reason)]))
+                Ok(Some(ChunkContent::Damaged(chunk::damaged(of.1, stored, &reason))))
             }
         }
     }

@@ -2,6 +2,7 @@
 
 use std::cmp::Reverse;
 
+use super::files::ChunkContent;
 use crate::cloud::Cloud;
 use crate::error::CloudResult;
 use crate::store::{KeptLine, LINE_MAX, NewestRecords, StoredChunk, large_line};
@@ -96,19 +97,24 @@ impl<'c> NewestFirst<'c> {
             }
         } else if let Some(chunk) = store.chunk_before(of, range).await? {
             if !skip(&chunk) {
-                let Some(lines) = self.cloud.chunk_lines(of, &chunk).await? else { return Ok(()) };
+                let content = self.cloud.chunk_content(of, &chunk).await?;
+                let Some(content) = content else { return Ok(()) };
                 self.read_bytes += chunk.bytes;
-                let is_damage = lines.len() as u64 != chunk.records;
-                for KeptLine { arrival, line, .. } in lines {
+                let found = |KeptLine { arrival, line, .. }: KeptLine| {
                     let bytes = line.len() as u64;
-                    let mut found = FoundLine { arrival, line, bytes };
-                    if is_damage {
-                        // What goes on after this line goes on after the chunk.
-                        found.arrival = chunk.first_arrival;
-                        self.found.push(found);
-                    } else if arrival > self.after && arrival < *before && pick(stream, &mut found)
-                    {
-                        self.found.push(found);
+                    FoundLine { arrival, line, bytes }
+                };
+                match content {
+                    // What goes on after this line goes on after the chunk.
+                    ChunkContent::Damaged(line) => {
+                        let line = KeptLine { arrival: chunk.first_arrival, ..line };
+                        self.found.push(found(line));
+                    }
+                    ChunkContent::Lines(mut lines) => {
+                        lines.retain(|it| it.arrival > self.after && it.arrival < *before);
+                        let lines = lines.into_iter().map(found);
+                        self.found
+                            .extend(lines.filter_map(|mut it| pick(stream, &mut it).then_some(it)));
                     }
                 }
             }

@@ -32,17 +32,33 @@ pub(crate) async fn keep(cloud: &Cloud) {
 
 /// Maximum number of chunks of a stream that are made one after the other.
 const CHUNKS_AT_ONCE: usize = 64;
+/// Number of streams with failures after which others wait for the next look: then it is probably
+/// the database or the place of the files that fails.
+const FAILURES_MAX: usize = 8;
 
 /// Moves the oldest records of each stream that has many into chunks; returns their number.
+///
+/// # Errors
+///
+/// An error once many streams cannot be packed. Below that, each is logged, and the others go on.
 pub(super) async fn pack(cloud: &Cloud, sizes: ChunkSizes) -> CloudResult<u64> {
-    let mut made = 0;
+    let (mut made, mut failures) = (0, 0);
     for (vehicle, stream) in cloud.store.packable(sizes).await? {
         // A stream that grows faster keeps no other one waiting.
         for _ in 0..CHUNKS_AT_ONCE {
-            if !pack_stream(cloud, (&vehicle, &stream), sizes).await? {
-                break;
+            match pack_stream(cloud, (&vehicle, &stream), sizes).await {
+                Ok(true) => made += 1,
+                Ok(false) => break,
+                Err(error) => {
+                    failures += 1;
+                    if failures == FAILURES_MAX {
+                        return Err(error);
+                    }
+                    let reason = error.reason();
+                    tracing::warn!(vehicle, stream, reason, "a stream stays in rows for now");
+                    break;
+                }
             }
-            made += 1;
         }
     }
     if made > 0 {

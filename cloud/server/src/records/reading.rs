@@ -4,6 +4,7 @@ use crate::cloud::Cloud;
 use crate::error::CloudResult;
 use crate::store::{KeptLine, RecordPage, StoredChunk};
 
+use super::files::ChunkContent;
 use super::newest::{FoundLine, NewestFirst};
 
 /// Maximum number of the newest records that are counted one by one: of more, all are sent.
@@ -64,8 +65,10 @@ impl Cloud {
     ) -> CloudResult<Option<(StoredChunk, Vec<KeptLine>)>> {
         loop {
             let Some(chunk) = self.store.chunk_after(of, part).await? else { return Ok(None) };
-            if let Some(lines) = self.chunk_lines(of, &chunk).await? {
-                return Ok(Some((chunk, lines)));
+            match self.chunk_content(of, &chunk).await? {
+                Some(ChunkContent::Lines(lines)) => return Ok(Some((chunk, lines))),
+                Some(ChunkContent::Damaged(line)) => return Ok(Some((chunk, vec![line]))),
+                None => {}
             }
         }
     }

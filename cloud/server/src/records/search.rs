@@ -28,7 +28,7 @@ const STREAMS: usize = 32;
 /// one is among the results as a line of kind `large`.
 const SEARCHED_MAX: u64 = 256 << 10;
 /// Searches that read at a time: more wait for their turn, and do not keep all threads busy.
-static SEARCHES: Semaphore = Semaphore::const_new(2);
+pub(super) static SEARCHES: Semaphore = Semaphore::const_new(2);
 /// Longest text to search for, in bytes.
 const TEXT_MAX: usize = 256;
 

@@ -5,7 +5,6 @@ use gleaner_protocol::vehicle_api::StreamLine;
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-use super::chunk;
 use super::packing::{pack, remove_old};
 use super::search::RecordSearch;
 use crate::cloud::Cloud;
@@ -39,15 +38,31 @@ impl Recorded {
     }
 
     async fn append_within(&self, stream: &str, seqs: std::ops::Range<u64>, bounds: Retention) {
+        let lines = seqs.map(|seq| (seq, String::new(), line(stream, seq))).collect();
+        self.append_lines(stream, lines, bounds).await;
+    }
+
+    /// Appends a record whose message has some more bytes.
+    async fn append_long(&self, stream: &str, seq: u64, more: usize) {
+        let line = line(stream, seq).replace("slips", &"s".repeat(more));
+        self.append_lines(stream, vec![(seq, String::new(), line)], Retention::DEFAULT).await;
+    }
+
+    async fn append_lines(
+        &self,
+        stream: &str,
+        lines: Vec<(u64, String, String)>,
+        bounds: Retention,
+    ) {
+        let last = lines.last().unwrap().0;
         let cursor = Cursor {
             stream: stream.to_owned(),
             life: 1,
-            next: seqs.end,
-            seq: seqs.end - 1,
+            next: last + 1,
+            seq: last,
             boot: "b".to_owned(),
             boot_ns: 7,
         };
-        let lines = seqs.map(|seq| (seq, String::new(), line(stream, seq))).collect();
         let batch = StreamBatch { lines, cursor };
         self.cloud.store.append(CAR, self.epoch, batch, bounds).await.unwrap();
     }
@@ -67,15 +82,34 @@ impl Recorded {
     }
 
     /// Returns the numbers of what a search finds, part by part.
-    async fn found(&self, mut search: RecordSearch) -> Vec<u64> {
-        let mut seqs = Vec::new();
+    async fn found(&self, search: RecordSearch) -> Vec<u64> {
+        self.found_lines(search).await.iter().map(|it| it.seq).collect()
+    }
+
+    async fn found_lines(&self, mut search: RecordSearch) -> Vec<StreamLine> {
+        let mut lines = Vec::new();
         loop {
             let found = self.cloud.search(&search).await.unwrap();
             assert!(found.items.iter().all(|it| it.vehicle == CAR));
-            seqs.extend(found.items.iter().map(|it| it.line.seq));
-            let Some(next) = found.next else { return seqs };
+            lines.extend(found.items.into_iter().map(|it| it.line));
+            let Some(next) = found.next else { return lines };
             assert_ne!(search.after.as_ref(), Some(&next), "it goes on");
             search.after = Some(next);
+        }
+    }
+
+    /// Returns the pages of a time line, from the newest record back.
+    async fn back(&self, streams: [&str; 2], most: usize) -> Vec<String> {
+        let streams = streams.map(str::to_owned);
+        let (mut before, mut back) = (i64::MAX, Vec::new());
+        loop {
+            let newest = self.cloud.newest(CAR, &streams, (0, before), most).await.unwrap();
+            back.extend(newest.lines.into_iter().map(|(_, line)| line));
+            before = newest.oldest_read;
+            if !newest.has_more {
+                back.reverse();
+                return back;
+            }
         }
     }
 
@@ -121,6 +155,9 @@ fn search(query: &str) -> RecordSearch {
     serde_json::from_value(Value::Object(values.collect())).unwrap()
 }
 
+mod interruptions;
+mod long_records;
+
 #[tokio::test]
 async fn records_in_chunks_and_rows_are_one_sequence() {
     let recorded = Recorded::start().await;
@@ -153,19 +190,7 @@ async fn records_in_chunks_and_rows_are_one_sequence() {
             assert_eq!(after, i64::try_from(count - last).unwrap());
         }
         assert_eq!(cloud.arrival_before(CAR, STREAMS, count).await.unwrap(), 0);
-        // The pages of a time line, from the newest back.
-        let streams = STREAMS.map(str::to_owned);
-        let (mut before, mut back) = (i64::MAX, Vec::new());
-        loop {
-            let newest = cloud.newest(CAR, &streams, (0, before), 9).await.unwrap();
-            back.extend(newest.lines.into_iter().map(|(_, line)| line));
-            before = newest.oldest_read;
-            if !newest.has_more {
-                break;
-            }
-        }
-        back.reverse();
-        assert_eq!(back, expected);
+        assert_eq!(recorded.back(STREAMS, 9).await, expected);
         // Records from a number on.
         let page = cloud.record_page(CAR, ["events"; 2], 30, 0, 3).await.unwrap();
         assert_eq!(page.lines[0], line("events", 30));
@@ -188,27 +213,6 @@ async fn two_processes_that_pack_at_once_lose_nothing_and_leave_no_file() {
     remove_old(cloud, 0).await.unwrap();
     let chunks = recorded.chunks().await;
     assert_eq!((chunks.len() as u64, recorded.files().len() as u64), (made, made));
-    assert_eq!(recorded.all(STREAMS).await, expected);
-}
-
-#[tokio::test]
-async fn a_chunk_that_was_interrupted_leaves_a_file_that_is_removed() {
-    let recorded = Recorded::start().await;
-    recorded.append("events", 0..100).await;
-    let expected = recorded.all(STREAMS).await;
-    let (store, of) = (&recorded.cloud.store, (CAR, "events"));
-    let lines = store.oldest_lines(of, SIZES).await.unwrap();
-    let (made, file) = chunk::encode(of, &lines).unwrap();
-    store.note_chunk_file(&made.sha256).await.unwrap();
-    recorded.cloud.chunks.keep(&made.sha256, file).await.unwrap();
-    // Killed here: the records are still in rows.
-    assert_eq!(recorded.all(STREAMS).await, expected);
-    remove_old(&recorded.cloud, 3600).await.unwrap();
-    assert_eq!(recorded.files().len(), 1, "it may still be made");
-    remove_old(&recorded.cloud, 0).await.unwrap();
-    assert_eq!(recorded.files().len(), 0);
-    // One that was only stopped goes on now.
-    assert!(!store.pack(of, &made).await.unwrap(), "its file is not there any more");
     assert_eq!(recorded.all(STREAMS).await, expected);
 }
 
@@ -236,12 +240,15 @@ async fn a_chunk_that_cannot_be_used_is_a_line_and_no_gap_or_failure() {
         let line: StreamLine = serde_json::from_str(line).unwrap();
         assert_eq!((line.seq, &line.record["to"]), (chunk.first_seq, &json!(chunk.last_seq)));
     }
-    let streams = STREAMS.map(str::to_owned);
-    let newest = recorded.cloud.newest(CAR, &streams, (0, i64::MAX), 1000).await.unwrap();
-    assert_eq!(newest.lines.len(), lines.len());
+    // Each is there once, however short the pages are.
+    for most in [1, 9, 1000] {
+        assert_eq!(recorded.back(STREAMS, most).await, lines, "pages of {most}");
+    }
     // A search states them, too: the text may be there.
-    let found = recorded.cloud.search(&search("text=wheel 1 ")).await.unwrap().items;
-    assert_eq!(found.iter().filter(|it| it.line.kind == "damaged").count(), 3);
+    for query in ["text=wheel 1 ", "text=wheel 1 &limit=1"] {
+        let found = recorded.found_lines(search(query)).await;
+        assert_eq!(found.iter().filter(|it| it.kind == "damaged").count(), 3, "{query}");
+    }
 }
 
 #[tokio::test]

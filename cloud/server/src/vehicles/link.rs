@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use axum::body::Bytes;
 use axum::extract::ws::{Message, WebSocket};
-use gleaner_base::{RateLimit, visible};
+use gleaner_base::{Exit, Failure, RateLimit, visible};
 use gleaner_fleet::{
     Ack, Body, Desired, Frame, GoAway, Hello, PROTOCOL, Ping, Pong, Records, Reported, TAIL_S,
     TAIL_STREAMS_MAX, Tail, Welcome, decompress,
@@ -14,11 +14,13 @@ use gleaner_fleet::{
 use gleaner_protocol::vehicle_api::VehicleStatus;
 use tokio::sync::{SemaphorePermit, watch};
 use tokio::time::{MissedTickBehavior, interval, sleep, timeout};
+use zstd::bulk::Decompressor;
 
 use super::batch;
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 use crate::hub::LinkOrders;
+use crate::place::blocking;
 use crate::store::{VehicleReport, VehicleTail, now, now_ms};
 
 /// Interval of signs of life, in s; without one for three of them, the connection is dead.
@@ -216,7 +218,8 @@ impl<'c> VehicleLink<'c> {
     /// Stores a report, as far as it has something new; returns whether the wanted state changed.
     async fn store_report(&mut self, reported: Reported) -> CloudResult<bool> {
         let frame = self.may_store().await;
-        let mut report = report(reported)?;
+        let most = text_max(&reported.status);
+        let mut report = parsed(most, move || report(reported)).await?;
         let _frame = frame.filter(|_| report.status.len() > SMALL);
         let (before, stored) = (self.stored, StoredReport::of(&report));
         if stored.whole == before.whole {
@@ -230,8 +233,8 @@ impl<'c> VehicleLink<'c> {
 
     async fn store_records(&mut self, records: Records) -> CloudResult<Ack> {
         let frame = self.may_store().await;
-        let batch = batch::parse(&records)?;
-        drop(records);
+        let most = text_max(&records.lines);
+        let batch = parsed(most, move || batch::parse(&records)).await?;
         let bytes = batch.lines.iter().map(|(_, _, line)| line.len()).sum::<usize>();
         let _frame = frame.filter(|_| bytes > SMALL);
         let (store, retention) = (&self.cloud.store, self.cloud.retention);
@@ -282,6 +285,25 @@ impl<'c> VehicleLink<'c> {
     }
 }
 
+/// Returns the most bytes that a compressed part of a frame can have once it is decompressed.
+fn text_max(compressed: &[u8]) -> usize {
+    Decompressor::upper_bound(compressed).unwrap_or(usize::MAX)
+}
+
+/// Parses a frame of at most so many bytes: a large one beside the threads that serve connections,
+/// which it would keep from others. Of these, as many are parsed at a time as may be stored.
+async fn parsed<T: Send + 'static>(
+    most: usize,
+    parse: impl FnOnce() -> CloudResult<T> + Send + 'static,
+) -> CloudResult<T> {
+    if most <= SMALL {
+        return parse();
+    }
+    let failed =
+        |error| Failure::caused_by(Exit::Internal, "a frame of a vehicle cannot be parsed", &error);
+    blocking(move || Ok(parse())).await.map_err(failed)?
+}
+
 /// Returns the frame of a lease.
 fn lease(tail: &VehicleTail) -> Tail {
     let streams = tail.streams.iter().take(TAIL_STREAMS_MAX).cloned().collect();
@@ -323,4 +345,25 @@ fn hash(value: &impl Hash) -> u64 {
 
 fn wrong(message: impl Into<String>) -> CloudError {
     CloudError::usage(message, "use a version of gleaner that fits the one of the cloud")
+}
+
+#[cfg(test)]
+mod tests {
+    use std::thread;
+
+    use gleaner_fleet::compress;
+
+    use super::*;
+
+    #[tokio::test]
+    async fn a_large_frame_is_parsed_beside_the_threads_of_connections() {
+        let own = thread::current().id();
+        for (bytes, is_own) in [(0, true), (SMALL, true), (SMALL + 1, false), (8 << 20, false)] {
+            // Of zeros, 8 MiB take a few hundred bytes.
+            let most = text_max(&compress(&vec![0; bytes]));
+            let other = parsed(most, || Ok(thread::current().id())).await.unwrap();
+            assert_eq!(other == own, is_own, "{bytes}");
+        }
+        assert!(text_max(b"no frame") > SMALL, "its length is unknown");
+    }
 }
