@@ -6,13 +6,14 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::Duration;
 
+use gleaner_bench_results::{Figure, quantile};
 use hyper::Method;
 use serde::Deserialize;
 use tokio::task::JoinSet;
 use tokio::time::sleep;
 
 use crate::administrator::Administrator;
-use crate::figure::{FleetFigure, quantile};
+use crate::figure::{at_most, free};
 use crate::fleet::{EnrolledFleet, enrol_all, start_all};
 use crate::identity::SimulatedIdentity;
 use crate::rollouts::Rollouts;
@@ -55,7 +56,7 @@ pub async fn figures(
     count: usize,
     kills: usize,
     interval: Duration,
-) -> Result<Vec<FleetFigure>, String> {
+) -> Result<Vec<Figure>, String> {
     let mut fleet = EnrolledFleet::enrol(count).await?;
     let (simulation, vehicles) = fleet.start(count, PAUSE_MAX);
     let all = |it: &Simulation| it.connected.load(Relaxed) == count;
@@ -72,7 +73,7 @@ pub async fn figures(
     }
     let EnrolledFleet { cloud, token, vehicles: identities, .. } = &fleet;
     let members = FleetMembers { people: cloud.people, token, identities };
-    let mut figures = vec![FleetFigure::free("kills: number of kills", "", kills as f64)];
+    let mut figures = vec![free("kills: number of kills", "", kills as f64)];
     figures.extend(finish(&simulation, vehicles, rollouts, &members).await?);
     figures.iter().for_each(|figure| println!("{figure}"));
     Ok(figures)
@@ -83,7 +84,7 @@ pub async fn figures_of(
     running: &RunningCloud,
     count: usize,
     time: Duration,
-) -> Result<Vec<FleetFigure>, String> {
+) -> Result<Vec<Figure>, String> {
     let token = Administrator::login(running.people, &running.code).await?;
     let identities = enrol_all(running.people, &token, count).await?;
     let (simulation, vehicles) = start_all(&identities, running.cloud, PAUSE_MAX);
@@ -108,7 +109,7 @@ async fn finish(
     mut vehicles: JoinSet<()>,
     rollouts: Rollouts,
     members: &FleetMembers<'_>,
-) -> Result<Vec<FleetFigure>, String> {
+) -> Result<Vec<Figure>, String> {
     let count = members.identities.len();
     let all = |it: &Simulation| it.connected.load(Relaxed) == count;
     let after = simulation.until(PATIENCE, all).await;
@@ -131,27 +132,22 @@ async fn finish(
 
     let reconnected = simulation.take_reconnected_s();
     let mut figures = vec![
-        FleetFigure::free("kills: vehicles", "", count as f64),
-        FleetFigure::free("kills: records that were acknowledged", "", sent),
-        FleetFigure::free("kills: records that are stored", "", stored),
-        FleetFigure::at_most("kills: records lost, or stored twice", "", 0.0, simulation.losses()),
-        FleetFigure::at_most("kills: all connected after the last one", "s", 30.0, after),
+        free("kills: vehicles", "", count as f64),
+        free("kills: records that were acknowledged", "", sent),
+        free("kills: records that are stored", "", stored),
+        at_most("kills: records lost, or stored twice", "", 0.0, simulation.losses()),
+        at_most("kills: all connected after the last one", "s", 30.0, after),
     ];
     figures.extend([
-        FleetFigure::free("kills: rollout steps", "", rollouts.steps.len() as f64),
-        FleetFigure::at_most("kills: rollout steps taken twice or missed", "", 0.0, wrong_steps),
-        FleetFigure::at_most(
-            "kills: releases that a vehicle got twice or not",
-            "",
-            0.0,
-            wrong_releases,
-        ),
+        free("kills: rollout steps", "", rollouts.steps.len() as f64),
+        at_most("kills: rollout steps taken twice or missed", "", 0.0, wrong_steps),
+        at_most("kills: releases that a vehicle got twice or not", "", 0.0, wrong_releases),
     ]);
     for (name, share) in [("p50", 0.5), ("p99", 0.99), ("max", 1.0)] {
         let name = format!("kills: time without a connection, {name}");
-        figures.push(FleetFigure::free(&name, "s", quantile(&reconnected, share)));
+        figures.push(free(&name, "s", quantile(&reconnected, share)));
     }
-    figures.push(FleetFigure::at_most("kills: other errors", "", 0.0, simulation.errors()));
+    figures.push(at_most("kills: other errors", "", 0.0, simulation.errors()));
     Ok(figures)
 }
 

@@ -4,11 +4,12 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::Duration;
 
+use gleaner_bench_results::{Figure, quantile};
 use gleaner_fleet::people::{FleetDeployment, ListPage};
 use hyper::Method;
 use tokio::time::{Instant, sleep, timeout};
 
-use crate::figure::{FleetFigure, quantile};
+use crate::figure::{at_most, free};
 use crate::fleet::EnrolledFleet;
 use crate::release::SignedRelease;
 use crate::simulation::FleetLoad;
@@ -35,32 +36,32 @@ pub struct LoadTimes {
 }
 
 /// Measures `count` vehicles.
-pub async fn figures(count: usize, times: &LoadTimes) -> Result<Vec<FleetFigure>, String> {
+pub async fn figures(count: usize, times: &LoadTimes) -> Result<Vec<Figure>, String> {
     let fleet = EnrolledFleet::enrol(count + SILENT + 1).await?;
     let cloud = &fleet.cloud;
     let mut figures = Vec::new();
-    let mut add = |figure: FleetFigure| {
+    let mut add = |figure: Figure| {
         println!("{figure}");
         figures.push(figure);
     };
-    add(FleetFigure::free("vehicles", "", count as f64));
-    add(FleetFigure::free("enrolment of all", "s", fleet.enrolled_s));
+    add(free("vehicles", "", count as f64));
+    add(free("enrolment of all", "s", fleet.enrolled_s));
     let of_each = |kb: f64| kb / count as f64;
 
     let (fresh_kb, cpu_s) = (cloud.memory_kb(), cloud.cpu_s());
     let (simulation, _vehicles) = fleet.start(count, PAUSE_MAX);
     let connected = simulation.until(PATIENCE, |it| it.connected.load(Relaxed) == count).await;
     let connected = connected.map_or(f64::INFINITY, |it| it.as_secs_f64());
-    add(FleetFigure::at_most("all connected after", "s", 15.0, connected));
-    add(FleetFigure::free("CPU of the cloud to connect all", "s", cloud.cpu_s() - cpu_s));
+    add(at_most("all connected after", "s", 15.0, connected));
+    add(free("CPU of the cloud to connect all", "s", cloud.cpu_s() - cpu_s));
 
     sleep(times.idle / 2).await;
     let cpu_s = cloud.cpu_s();
     sleep(times.idle / 2).await;
     let idle_cores = (cloud.cpu_s() - cpu_s) / times.idle.as_secs_f64() * 2.0;
-    add(FleetFigure::free("idle: cores of the cloud", "cores", idle_cores));
+    add(free("idle: cores of the cloud", "cores", idle_cores));
     let idle_kb = of_each(cloud.memory_kb() - fresh_kb);
-    add(FleetFigure::at_most("memory per idle vehicle", "kB", 20.0, idle_kb));
+    add(at_most("memory per idle vehicle", "kB", 20.0, idle_kb));
 
     let silent: Vec<_> = fleet.vehicles[count..count + SILENT].to_vec();
     let silent = silent.into_iter().filter(|_| times.has_silent).map(|identity| {
@@ -86,20 +87,16 @@ pub async fn figures(count: usize, times: &LoadTimes) -> Result<Vec<FleetFigure>
     let active_s = begun.elapsed().as_secs_f64();
     let reports = (simulation.reports.load(Relaxed) - reports) as f64;
     let acknowledged = simulation.take_acknowledged_ms();
-    add(FleetFigure::free(
-        "active: cores of the cloud",
-        "cores",
-        (cloud.cpu_s() - cpu_s) / active_s,
-    ));
-    add(FleetFigure::free("active: reports", "1/s", reports / active_s));
+    add(free("active: cores of the cloud", "cores", (cloud.cpu_s() - cpu_s) / active_s));
+    add(free("active: reports", "1/s", reports / active_s));
     let batches = acknowledged.len() as f64 / active_s;
-    add(FleetFigure::free("active: batches of records", "1/s", batches));
+    add(free("active: batches of records", "1/s", batches));
     for (name, share) in [("p50", 0.5), ("p99", 0.99), ("max", 1.0)] {
         let name = format!("active: batch to acknowledgement, {name}");
-        add(FleetFigure::free(&name, "ms", quantile(&acknowledged, share)));
+        add(free(&name, "ms", quantile(&acknowledged, share)));
     }
     let active_kb = of_each(cloud.memory_kb() - fresh_kb);
-    add(FleetFigure::at_most("memory per active vehicle", "kB", 50.0, active_kb));
+    add(at_most("memory per active vehicle", "kB", 50.0, active_kb));
 
     let mut administrator = fleet.administrator().await?;
     let cpu_s = cloud.cpu_s();
@@ -113,14 +110,14 @@ pub async fn figures(count: usize, times: &LoadTimes) -> Result<Vec<FleetFigure>
         true => quantile(&applied, most as f64 / applied.len() as f64),
         false => f64::INFINITY,
     };
-    add(FleetFigure::at_most("a deployment is applied by 99 % after", "s", 30.0, p99));
-    add(FleetFigure::free("CPU of the cloud for it", "s", cloud.cpu_s() - cpu_s));
+    add(at_most("a deployment is applied by 99 % after", "s", 30.0, p99));
+    add(free("CPU of the cloud for it", "s", cloud.cpu_s() - cpu_s));
     simulation.until(PATIENCE, |it| it.applied_s().len() >= count).await;
     // The cloud closes connections without a request.
     let mut administrator = fleet.administrator().await?;
     let begun = Instant::now();
     let all: ListPage<FleetDeployment> = administrator.get("/v1/deployments").await?;
-    add(FleetFigure::free("list of deployments", "s", begun.elapsed().as_secs_f64()));
+    add(free("list of deployments", "s", begun.elapsed().as_secs_f64()));
     if all.items.first().map(|it| it.running) != Some(count as u64) {
         simulation.error(format!("of {count} vehicles, these run it: {all:?}"));
     }
@@ -134,15 +131,15 @@ pub async fn figures(count: usize, times: &LoadTimes) -> Result<Vec<FleetFigure>
         async { while let Some(Ok(_)) = futures_util::StreamExt::next(&mut socket).await {} };
     let cut_s =
         timeout(PATIENCE, ended).await.map_or(f64::INFINITY, |()| begun.elapsed().as_secs_f64());
-    add(FleetFigure::at_most("a vehicle that is removed is cut off after", "s", 5.0, cut_s));
+    add(at_most("a vehicle that is removed is cut off after", "s", 5.0, cut_s));
     let mut silent_s = Vec::new();
     for link in silent {
         silent_s.push(link.await.map_err(|error| error.to_string())?);
     }
     if times.has_silent {
         let longest = quantile(&silent_s, 1.0);
-        add(FleetFigure::at_most("a silent connection is ended after", "s", 60.5, longest));
+        add(at_most("a silent connection is ended after", "s", 60.5, longest));
     }
-    add(FleetFigure::at_most("errors", "", 0.0, simulation.errors() + simulation.losses()));
+    add(at_most("errors", "", 0.0, simulation.errors() + simulation.losses()));
     Ok(figures)
 }

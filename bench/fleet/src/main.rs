@@ -21,12 +21,13 @@ mod simulation;
 mod vehicle;
 
 use std::net::SocketAddr;
+use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
 
 use chaos::RunningCloud;
 use clap::Parser;
-use figure::FleetFigure;
+use gleaner_bench_results::{BenchResults, Figure};
 use load::LoadTimes;
 
 /// Measures the cloud under a simulated fleet and prints a table in Markdown.
@@ -35,6 +36,9 @@ struct Args {
     /// 1,000 vehicles for a short time: tests the bench itself; figures of time do not count.
     #[arg(long)]
     quick: bool,
+    /// Folder for results.json, results.md and report.html
+    #[arg(long, value_name = "DIR", default_value = "target/bench/fleet")]
+    out: PathBuf,
     /// Number of vehicles under load
     #[arg(long, value_name = "N")]
     vehicles: Option<usize>,
@@ -64,15 +68,20 @@ fn main() -> ExitCode {
         Ok(runtime) => runtime.block_on(measure(&args)),
         Err(error) => Err(format!("cannot start threads: {error}")),
     };
+    let mut results = BenchResults::new("fleet", args.quick);
     match measured {
-        Ok(figures) => match figures
-            .iter()
-            .filter(|it| !args.quick || it.is_of_errors())
-            .all(FleetFigure::is_met)
-        {
-            true => ExitCode::SUCCESS,
-            false => ExitCode::FAILURE,
-        },
+        Ok(figures) => {
+            results.figures = figures;
+            results.machine.add_load("load after");
+            if let Err(failure) = results.store(&args.out) {
+                eprintln!("{failure}");
+                return failure.exit.into();
+            }
+            println!("\nresults and page: {}", args.out.display());
+            // In a short run, only errors count.
+            let mut counted = results.figures.iter().filter(|it| !args.quick || it.is_of_errors());
+            ExitCode::from(u8::from(!counted.all(Figure::is_met)))
+        }
         Err(reason) => {
             eprintln!("error: the fleet cannot be measured\n  cause: {reason}");
             ExitCode::FAILURE
@@ -80,7 +89,7 @@ fn main() -> ExitCode {
     }
 }
 
-async fn measure(args: &Args) -> Result<Vec<FleetFigure>, String> {
+async fn measure(args: &Args) -> Result<Vec<Figure>, String> {
     if let (Some(people), Some(cloud), Some(code)) = (args.people, args.cloud, &args.code) {
         let running = RunningCloud { people, cloud, code: code.clone() };
         let time = Duration::from_secs(args.seconds.unwrap_or(60));
@@ -95,7 +104,7 @@ async fn measure(args: &Args) -> Result<Vec<FleetFigure>, String> {
     };
     let kills = args.kills.unwrap_or(if args.quick { 2 } else { 60 });
     let mut figures = Vec::new();
-    println!("| measurement | promise | measured | |\n|---|---|---|---|");
+    println!("| measurement | goal | median | spread | runs | |\n|---|---|---|---|---|---|");
     if vehicles > 0 {
         figures.extend(load::figures(vehicles, &times).await?);
     }
