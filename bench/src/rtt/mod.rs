@@ -64,8 +64,11 @@ pub fn measure(quick: bool, options: &RttOptions, results: &mut BenchResults) {
          the stamp of the answer, just before it is sent."
             .to_owned(),
     );
-    let workloads =
-        if options.workload.is_empty() { Workload::ALL.to_vec() } else { options.workload.clone() };
+    let workloads = match &options.workload[..] {
+        [] if quick => vec![Workload::Empty, Workload::ImuFft, Workload::Brake720],
+        [] => Workload::ALL.to_vec(),
+        some => some.to_vec(),
+    };
     let limit = BufferLimit::of_this_machine();
     for workload in workloads {
         let rows = if quick { vec![None] } else { workload.buffers() };
