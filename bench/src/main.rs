@@ -44,7 +44,7 @@ enum BenchCommand {
         #[command(flatten)]
         options: rtt::RttOptions,
     },
-    /// What one and several lambdas receive and cost; needs gleaner-player.
+    /// Samples that one and several lambdas receive, and their costs; needs gleaner-player.
     Scale,
     /// Effect of a misbehaving lambda on others, and the start of a lambda; needs gleaner-player.
     Isolation,

@@ -9,7 +9,7 @@ use crate::page::{MEASUREMENT_SCRIPTS, html};
 pub struct MeasurementPage {
     /// Its title.
     pub title: String,
-    /// Where it comes from, in a line below the title.
+    /// The origin of the measurements, in a line below the title.
     pub origin: String,
     /// Facts about the machine: name and value.
     pub facts: Vec<(String, String)>,

@@ -67,8 +67,8 @@ pub(crate) fn set_up_for_tests(checkout: &Checkout) -> Result<(), Failure> {
     if has(checkout, &FOR_TESTS) { Ok(()) } else { fetch(checkout, &FOR_TESTS) }
 }
 
-/// Makes an environment of its own in `folder`, with packages that lambdas do not need: name in pip,
-/// and name of the module. Returns its Python.
+/// Makes an environment of its own in `folder`, with packages that lambdas do not need: name in
+/// pip, and name of the module. Returns its Python.
 pub(crate) fn apart(
     checkout: &Checkout,
     folder: &Path,

@@ -32,7 +32,7 @@ GRACE_S = 5.0
 
 
 class Node(Protocol):
-    """What a stack does for a workload: it reads the inputs and writes the answers."""
+    """A stack that serves a workload: it reads the inputs and writes the answers."""
 
     stack: str
     """Name and version of the stack."""

@@ -16,7 +16,7 @@ const FILE: &[u8] = b"content of a lambda";
 /// A signed release for the whole fleet.
 pub struct SignedRelease {
     pub number: u64,
-    /// SHA-256 of its envelope, by which vehicles are told to run it.
+    /// SHA-256 of its envelope, by which a cloud names it to vehicles.
     pub envelope: String,
     request: FleetDeployRequest,
 }

@@ -48,7 +48,7 @@ pub struct Simulation {
     ends: Mutex<HashMap<String, u64>>,
     reconnected_s: Mutex<Vec<f64>>,
     applied_s: Mutex<(Option<Instant>, Vec<f64>)>,
-    /// The envelopes that a vehicle was told to run, one after the other; empty for none.
+    /// The envelopes that the cloud wanted a vehicle to run, one after the other; empty for none.
     told: Mutex<HashMap<String, Vec<String>>>,
 }
 
@@ -121,7 +121,7 @@ impl Simulation {
         lock(&self.ends).get(vehicle).copied().unwrap_or(0)
     }
 
-    /// Notes the envelope that a vehicle is told to run; empty for none.
+    /// Notes the envelope that the cloud wants a vehicle to run; empty for none.
     pub fn told(&self, vehicle: &str, envelope: &str) {
         let mut told = lock(&self.told);
         let of_vehicle = told.entry(vehicle.to_owned()).or_default();
@@ -130,7 +130,7 @@ impl Simulation {
         }
     }
 
-    /// Returns the different envelopes that a vehicle was told to run, one after the other.
+    /// Returns the different envelopes that the cloud wanted a vehicle to run, one after the other.
     pub fn told_to(&self, vehicle: &str) -> Vec<String> {
         lock(&self.told).get(vehicle).cloned().unwrap_or_default()
     }

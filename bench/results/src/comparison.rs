@@ -4,7 +4,7 @@ use crate::markdown::{COMPARED, number, table};
 use crate::results::BenchResults;
 use crate::statistics::{MeasuredDifference, Summary};
 
-/// What two runs have in common, and what only one of them has.
+/// The rows that two runs have in common, and those that only one of them has.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Comparison {
     rows: Vec<ComparedFigure>,

@@ -19,7 +19,7 @@ pub enum Goal {
 /// A row.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Figure {
-    /// What was measured.
+    /// The measured quantity.
     pub name: String,
     /// The unit of its values.
     pub unit: String,

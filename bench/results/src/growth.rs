@@ -7,7 +7,7 @@ use crate::markdown::number;
 /// Curves over a common quantity.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Growth {
-    /// What is shown, and under which conditions.
+    /// The measured quantity, and its conditions.
     pub name: String,
     /// The quantity that is set, in plural: `lambdas`.
     pub of: String,
@@ -22,7 +22,7 @@ pub struct Growth {
 pub struct GrowthCurve {
     /// Its name.
     pub name: String,
-    /// What was set, and what was measured.
+    /// Pairs of the number that was set, and the measured value.
     pub points: Vec<[f64; 2]>,
 }
 

@@ -1,7 +1,8 @@
 //! Results of a benchmark: what was measured, on which machine, and what it means.
 //!
 //! - [`BenchResults`] is one run: tables of [`Figure`]s, and [`Series`] of single measurements with
-//!   all of their values, and quantities with their [`Growth`]. It is stored as JSON, as Markdown, and as a page with plots.
+//!   all of their values, and quantities with their [`Growth`]. It is stored as JSON, as Markdown,
+//!   and as a page with plots.
 //! - [`Summary`] has the statistics of a series, and [`MeasuredDifference`] compares two.
 //! - [`Comparison`] compares two runs.
 //! - [`Machine`] is where a run took place.

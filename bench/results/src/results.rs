@@ -14,7 +14,7 @@ use crate::machine::Machine;
 /// Version of the format of the JSON file.
 const FORMAT: u32 = 1;
 
-/// What one run of a benchmark has measured.
+/// The measurements of one run of a benchmark.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct BenchResults {
     format: u32,
@@ -22,7 +22,7 @@ pub struct BenchResults {
     pub bench: String,
     /// True if it ran for a short time: the values show only that it works.
     pub is_quick: bool,
-    /// Where it ran.
+    /// The machine on which it ran.
     pub machine: Machine,
     /// Rows with a value for each run.
     pub figures: Vec<Figure>,
@@ -50,7 +50,7 @@ pub struct SeriesGroup {
 /// Measurements of one kind, in the order in which they were made.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Series {
-    /// What was measured, for example one side of a comparison.
+    /// The measured thing, for example one side of a comparison.
     pub name: String,
     /// Facts about it, for example its socket buffer.
     pub details: BTreeMap<String, String>,
@@ -60,7 +60,7 @@ pub struct Series {
     pub values: Vec<f64>,
 }
 
-/// What was sent, and what arrived.
+/// Numbers of messages that were sent and answered.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Reception {
     /// Number of messages that were sent.

@@ -27,7 +27,7 @@ pub(super) struct Load<'a> {
     pub seconds: u32,
 }
 
-/// What a load costs.
+/// The costs of a load.
 pub(super) struct LoadCosts {
     /// Shares of a core, of the ingress and of all processes.
     pub(super) ingress_percent: f64,

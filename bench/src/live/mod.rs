@@ -5,6 +5,7 @@ mod busy_cores;
 mod load;
 mod scale;
 
+use std::fs::{File, TryLockError};
 use std::io;
 use std::path::PathBuf;
 use std::process::{Command, ExitStatus};
@@ -47,6 +48,16 @@ pub(crate) fn starter() -> Option<String> {
 fn start_in_private_network() -> Result<bool, String> {
     if let Some(why) = namespace::unavailable().or(no_player()) {
         return Err(why.to_owned());
+    }
+    // Of two at once, the second one would restore what the first one has set.
+    let limit = File::open(BUFFER_LIMIT);
+    if let Ok(limit) = &limit
+        && let Err(TryLockError::WouldBlock) = limit.try_lock()
+    {
+        eprintln!(
+            "error: another benchmark of live topics runs on this machine\n  help:  wait for its end"
+        );
+        return Ok(false);
     }
     let before = std::fs::read_to_string(BUFFER_LIMIT).unwrap_or_default();
     let is_small = before.trim().parse::<u64>().is_ok_and(|bytes| bytes < BUFFER_BYTES);

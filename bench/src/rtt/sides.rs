@@ -34,7 +34,7 @@ pub(super) struct LambdaSide {
     pub(super) last: Option<LiveStatus>,
 }
 
-/// What one turn has measured.
+/// The measurements of one turn.
 pub(super) struct Turn {
     /// Round trips after the warm-up, in the order of their answers.
     pub(super) times_ms: Vec<f64>,

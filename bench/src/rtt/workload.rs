@@ -1,4 +1,4 @@
-//! What is answered: the inputs, and the sides that answer them.
+//! Workloads: the inputs, and the sides that answer them.
 
 use clap::ValueEnum;
 use gleaner_tests::LambdaCopy;

@@ -58,7 +58,7 @@ impl ChunkFiles {
     }
 }
 
-/// What is read of a chunk.
+/// The content of a chunk, as far as it can be read.
 pub(super) enum ChunkContent {
     Lines(Vec<KeptLine>),
     /// The line in the place of one whose file cannot be used, with the reason.
