@@ -30,14 +30,17 @@ pub struct Figure {
 }
 
 impl Figure {
-    /// Returns a row whose median should be `goal` or more.
+    /// Returns a row whose median should be `goal` or more. A goal that is itself measured, and
+    /// could not be, is none.
     pub fn at_least(name: &str, unit: &str, goal: f64, values: &[f64]) -> Self {
-        Self { goal: Some(Goal::AtLeast(goal)), ..Self::without_goal(name, unit, values) }
+        let goal = goal.is_finite().then_some(Goal::AtLeast(goal));
+        Self { goal, ..Self::without_goal(name, unit, values) }
     }
 
-    /// Returns a row whose median should be `goal` or less.
+    /// As [`at_least`](Self::at_least), for `goal` or less.
     pub fn at_most(name: &str, unit: &str, goal: f64, values: &[f64]) -> Self {
-        Self { goal: Some(Goal::AtMost(goal)), ..Self::without_goal(name, unit, values) }
+        let goal = goal.is_finite().then_some(Goal::AtMost(goal));
+        Self { goal, ..Self::without_goal(name, unit, values) }
     }
 
     /// Returns a row for information.
@@ -116,6 +119,9 @@ mod tests {
         assert!(!Figure::at_least("rate", "Hz", 20.0, &[10.0]).is_met());
         let missing = Figure::at_most("errors", "", 0.0, &[f64::NAN]);
         assert!(!missing.is_met() && missing.to_string().contains("not measured"), "{missing}");
+        let unknown = Figure::at_most("a", "", f64::NAN, &[1.0]);
+        let text = serde_json::to_string(&unknown).unwrap();
+        assert_eq!(serde_json::from_str::<Figure>(&text).unwrap(), unknown);
         assert!(missing.is_of_errors() && Figure::without_goal("", "", &[]).is_met());
     }
 }

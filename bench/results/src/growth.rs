@@ -49,19 +49,25 @@ impl Growth {
         set.into_iter().map(row).collect()
     }
 
-    /// Returns a sentence for each curve: its slope.
-    pub(crate) fn slopes(&self) -> Vec<String> {
-        let sentence = |curve: &GrowthCurve| {
+    /// Returns the heads of the table of slopes.
+    pub(crate) fn slope_heads(&self) -> Vec<String> {
+        let slope = format!("{} for each further one of the {}", self.unit, self.of);
+        vec!["slope (least squares)".to_owned(), slope, "from, to".to_owned()]
+    }
+
+    /// Returns a row for each curve with a slope.
+    pub(crate) fn slopes(&self) -> Vec<Vec<String>> {
+        let row = |curve: &GrowthCurve| {
             let slope = curve.slope()?;
             let [first, last] = [curve.points.first()?[0], curve.points.last()?[0]];
-            let (of, unit) = (&self.of, &self.unit);
-            Some(format!(
-                "{}: {slope:+.2} {unit} for each of the further {of}, from {first} to {last} \
-                 (least squares)",
-                curve.name
-            ))
+            let sign = if slope < 0.0 { "" } else { "+" };
+            Some(vec![
+                curve.name.clone(),
+                format!("{sign}{}", number(slope)),
+                format!("{first}, {last}"),
+            ])
         };
-        self.curves.iter().filter_map(sentence).collect()
+        self.curves.iter().filter_map(row).collect()
     }
 }
 
@@ -98,8 +104,7 @@ mod tests {
         };
         assert_eq!(growth.heads(), ["lambdas", "wasm, % of a core", "Python, % of a core"]);
         assert_eq!(growth.rows()[..2], [["1", "5.00", "-"], ["4", "6.50", "7.00"]]);
-        let expected = "wasm: +0.50 % of a core for each of the further lambdas, from 1 to 16 \
-                        (least squares)";
-        assert_eq!(growth.slopes(), [expected]);
+        assert_eq!(growth.slope_heads()[1], "% of a core for each further one of the lambdas");
+        assert_eq!(growth.slopes(), [["wasm", "+0.500", "1, 16"]]);
     }
 }

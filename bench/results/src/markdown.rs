@@ -39,10 +39,7 @@ impl BenchResults {
         for growth in &self.growths {
             let _ = write!(text, "\n## {}\n", growth.name);
             table(&mut text, &growth.heads(), growth.rows().into_iter());
-            text.push('\n');
-            for slope in growth.slopes() {
-                let _ = writeln!(text, "- {slope}");
-            }
+            table(&mut text, &growth.slope_heads(), growth.slopes().into_iter());
         }
         if !self.notes.is_empty() {
             text.push('\n');

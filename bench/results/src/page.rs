@@ -57,9 +57,12 @@ impl Growth {
         };
         MeasurementSection {
             title: self.name.clone(),
-            note: self.slopes().join("; "),
+            note: String::new(),
             plots: vec![plot],
-            tables: vec![PlotTable { heads: self.heads(), rows: self.rows() }],
+            tables: vec![
+                PlotTable { heads: self.heads(), rows: self.rows() },
+                PlotTable { heads: self.slope_heads(), rows: self.slopes() },
+            ],
         }
     }
 }

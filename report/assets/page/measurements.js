@@ -35,7 +35,8 @@ function drawPlot(plot, place) {
     padding: [10, 16, 0, 0],
     cursor: { drag: { x: false, y: false }, points: { show: false } },
     legend: { live: false },
-    scales: { x: { time: false, ...(plot.is_x_logarithmic ? logarithmic : {}) } },
+    // From zero, so that heights can be compared.
+    scales: { x: { time: false, ...(plot.is_x_logarithmic ? logarithmic : {}) }, y: { range: (_, low, high) => [Math.min(low, 0), high * 1.05] } },
     axes: [
       { ...axis, label: plot.x, size: 30, labelSize: 20, ...(plot.is_x_logarithmic ? ticks : {}), values: (_, splits) => splits.map(number) },
       { ...axis, label: plot.y, size: 56, labelSize: 20 },
