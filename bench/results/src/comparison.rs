@@ -60,7 +60,7 @@ impl Comparison {
 
     /// Returns a table, with a verdict for each row.
     pub fn to_markdown(&self) -> String {
-        let heads = [&["measurement", "A", "B"][..], &COMPARED, &["B"]].concat();
+        let heads = [&["measurement", "A", "B"][..], &COMPARED, &["B is"]].concat();
         let heads: Vec<String> = heads.into_iter().map(str::to_owned).collect();
         let rows = self.rows.iter().map(|row| {
             let medians = row.medians.map(|median| format!("{} {}", number(median), row.unit));

@@ -109,7 +109,10 @@ impl MeasuredDifference {
             None => "too few values".to_owned(),
         };
         let p = if self.p < 0.001 { "< 0.001".to_owned() } else { format!("{:.3}", self.p) };
-        [format!("{:.2}", self.ratio), interval, format!("{:+.2}", self.effect), p]
+        // None of something has no ratio to none of it.
+        let ratio =
+            if self.ratio.is_finite() { format!("{:.2}", self.ratio) } else { "-".to_owned() };
+        [ratio, interval, format!("{:+.2}", self.effect), p]
     }
 }
 
