@@ -1,7 +1,7 @@
-//! The two versions of a lambda, and the cores that measure them.
+//! The two versions of a lambda, the cores that measure them, and the memory of a process.
 
 use std::fmt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use gleaner_tests::root;
 
@@ -52,4 +52,22 @@ pub fn bind_to(core: usize) -> std::io::Result<()> {
     let mut one = rustix::thread::CpuSet::new();
     one.set(core);
     Ok(rustix::thread::sched_setaffinity(None, &one)?)
+}
+
+/// Peak of the resident memory of a process in MiB; NaN if unknown.
+pub fn peak_mib(pid: u32) -> f64 {
+    memory_mib(pid, "status", "VmHWM:")
+}
+
+/// Memory of a process in MiB, its share of shared pages included (PSS); NaN if unknown.
+pub fn pss_mib(pid: u32) -> f64 {
+    memory_mib(pid, "smaps_rollup", "Pss:")
+}
+
+fn memory_mib(pid: u32, file: &str, key: &str) -> f64 {
+    let path = Path::new("/proc").join(pid.to_string()).join(file);
+    let text = std::fs::read_to_string(path).unwrap_or_default();
+    let value = text.lines().find_map(|line| line.strip_prefix(key));
+    let kib = value.and_then(|value| value.trim().trim_end_matches(" kB").parse::<f64>().ok());
+    kib.map_or(f64::NAN, |kib| kib / 1024.0)
 }

@@ -127,7 +127,7 @@ async fn finish(
     let mut administrator = Administrator::connect(members.people, members.token).await?;
     let wrong_steps = rollouts.wrong_steps(&mut administrator).await?;
     let names = members.identities.iter().map(|it| &it.name);
-    let wrong_of = |name: &String| rollouts.wrong_releases(&simulation.told_to(name));
+    let wrong_of = |name: &String| rollouts.wrong_releases(&simulation.wanted_of(name));
     let wrong_releases = names.map(wrong_of).sum::<usize>() as f64;
 
     let reconnected = simulation.take_reconnected_s();

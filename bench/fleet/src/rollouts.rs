@@ -81,8 +81,8 @@ impl FinishedRollouts {
     }
 
     /// Returns the number of releases that a vehicle did not get exactly once, or not in order.
-    pub fn wrong_releases(&self, told: &[String]) -> usize {
-        differences(&self.envelopes, told)
+    pub fn wrong_releases(&self, wanted: &[String]) -> usize {
+        differences(&self.envelopes, wanted)
     }
 }
 

@@ -49,7 +49,7 @@ pub struct Simulation {
     reconnected_s: Mutex<Vec<f64>>,
     applied_s: Mutex<(Option<Instant>, Vec<f64>)>,
     /// The envelopes that the cloud wanted a vehicle to run, one after the other; empty for none.
-    told: Mutex<HashMap<String, Vec<String>>>,
+    wanted: Mutex<HashMap<String, Vec<String>>>,
 }
 
 #[derive(Default)]
@@ -84,7 +84,7 @@ impl Simulation {
             ends: Mutex::default(),
             reconnected_s: Mutex::default(),
             applied_s: Mutex::default(),
-            told: Mutex::default(),
+            wanted: Mutex::default(),
         }
     }
 
@@ -122,17 +122,17 @@ impl Simulation {
     }
 
     /// Notes the envelope that the cloud wants a vehicle to run; empty for none.
-    pub fn told(&self, vehicle: &str, envelope: &str) {
-        let mut told = lock(&self.told);
-        let of_vehicle = told.entry(vehicle.to_owned()).or_default();
+    pub fn wants(&self, vehicle: &str, envelope: &str) {
+        let mut wanted = lock(&self.wanted);
+        let of_vehicle = wanted.entry(vehicle.to_owned()).or_default();
         if of_vehicle.last().map_or("", |last| last) != envelope {
             of_vehicle.push(envelope.to_owned());
         }
     }
 
     /// Returns the different envelopes that the cloud wanted a vehicle to run, one after the other.
-    pub fn told_to(&self, vehicle: &str) -> Vec<String> {
-        lock(&self.told).get(vehicle).cloned().unwrap_or_default()
+    pub fn wanted_of(&self, vehicle: &str) -> Vec<String> {
+        lock(&self.wanted).get(vehicle).cloned().unwrap_or_default()
     }
 
     /// Notes the time from the end of a connection to the next one.

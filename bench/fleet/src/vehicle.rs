@@ -48,7 +48,7 @@ pub struct SimulatedVehicle {
     /// Each deployment that runs: id, envelope, release and digest of its revision.
     runs: Vec<RunningRelease>,
     /// Numbers of the last wanted state, and of the one that was applied.
-    told: u64,
+    received: u64,
     handled: u64,
 }
 
@@ -64,8 +64,8 @@ impl SimulatedVehicle {
     pub fn new(identity: SimulatedIdentity, simulation: Arc<Simulation>) -> Self {
         let load = simulation.load.subscribe();
         let (next, acknowledged, waiting) = (0, 0, None);
-        let (runs, told, handled) = (vec![], 0, 0);
-        Self { identity, simulation, load, next, acknowledged, waiting, runs, told, handled }
+        let (runs, received, handled) = (vec![], 0, 0);
+        Self { identity, simulation, load, next, acknowledged, waiting, runs, received, handled }
     }
 
     /// Keeps a connection for as long as the bench runs, and pauses after each end as a real
@@ -194,13 +194,14 @@ impl SimulatedVehicle {
     async fn apply(&mut self, socket: &mut Socket, desired: Desired) -> Result<(), String> {
         let simulation = Arc::clone(&self.simulation);
         let Desired { generation, deployments } = desired;
-        if generation < self.told {
-            let Self { identity, told, .. } = self;
-            simulation.error(format!("{}: wanted state {generation} after {told}", identity.name));
+        if generation < self.received {
+            let Self { identity, received, .. } = self;
+            simulation
+                .error(format!("{}: wanted state {generation} after {received}", identity.name));
         }
-        self.told = generation;
+        self.received = generation;
         let wanted: Vec<_> = deployments.into_iter().filter(|it| it.is_wanted).collect();
-        simulation.told(&self.identity.name, wanted.first().map_or("", |it| &it.envelope));
+        simulation.wants(&self.identity.name, wanted.first().map_or("", |it| &it.envelope));
         let turn = simulation.files.acquire().await.map_err(|error| error.to_string())?;
         let (mut runs, mut files) = (Vec::new(), None);
         for Wanted { id, envelope, .. } in wanted {

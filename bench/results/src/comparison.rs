@@ -2,7 +2,7 @@
 
 use crate::markdown::{COMPARED, number, table};
 use crate::results::BenchResults;
-use crate::statistics::{MeasuredDifference, Summary};
+use crate::statistics::MeasuredDifference;
 
 /// The rows that two runs have in common, and those that only one of them has.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -19,7 +19,6 @@ pub struct Comparison {
 struct ComparedFigure {
     name: String,
     unit: String,
-    medians: [f64; 2],
     difference: MeasuredDifference,
 }
 
@@ -35,14 +34,10 @@ impl Comparison {
                 comparison.alone.push(name.clone());
                 continue;
             };
-            let (Some(first), Some(second)) = (Summary::of(values), Summary::of(others)) else {
-                continue;
-            };
             let Some(difference) = MeasuredDifference::between(values, others) else { continue };
             comparison.rows.push(ComparedFigure {
                 name: name.clone(),
                 unit: unit.clone(),
-                medians: [first.median, second.median],
                 difference,
             });
         }
@@ -63,7 +58,8 @@ impl Comparison {
         let heads = [&["measurement", "A", "B"][..], &COMPARED, &["B is"]].concat();
         let heads: Vec<String> = heads.into_iter().map(str::to_owned).collect();
         let rows = self.rows.iter().map(|row| {
-            let medians = row.medians.map(|median| format!("{} {}", number(median), row.unit));
+            let medians =
+                row.difference.medians.map(|median| format!("{} {}", number(median), row.unit));
             let mut cells = vec![row.name.clone()];
             cells.extend(medians);
             cells.extend(row.difference.cells());

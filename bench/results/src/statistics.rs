@@ -55,7 +55,9 @@ impl Summary {
 /// The difference between two sets of values `a` and `b`, in the order of their measurement.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct MeasuredDifference {
-    /// Median of `b` divided by that of `a`.
+    /// Medians of `a` and `b`.
+    pub medians: [f64; 2],
+    /// The second one divided by the first one.
     pub ratio: f64,
     /// Interval of 95 % of the ratio, by drawing blocks of neighbours again; `None` with fewer than
     /// five values on a side.
@@ -75,6 +77,7 @@ impl MeasuredDifference {
         let (u, z) = mann_whitney(a, b);
         let is_enough = a.len().min(b.len()) >= FEWEST;
         Some(Self {
+            medians,
             ratio: medians[1] / medians[0],
             interval: is_enough.then(|| ratio_interval(a, b)),
             effect: 2.0 * u / (a.len() as f64 * b.len() as f64) - 1.0,

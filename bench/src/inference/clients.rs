@@ -8,7 +8,8 @@ use gleaner_bench_results::{BenchResults, Figure, Series, SeriesGroup, quantile}
 
 use super::frames::FrameFile;
 use super::lambda_path::LambdaPath;
-use super::model_process::{BenchModel, ModelProcess, peak_mib, pss_mib};
+use super::model_process::{BenchModel, ModelProcess};
+use crate::measure::{peak_mib, pss_mib};
 
 /// Time between two calls of the patient lambda.
 const PERIOD: Duration = Duration::from_millis(100);

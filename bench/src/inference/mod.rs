@@ -19,10 +19,11 @@ mod yolo_graph;
 use gleaner_tests::{TempFolder, root};
 use gleaner_vision::DetectorLayout;
 
+use crate::measure::{peak_mib, pss_mib};
 use frames::FrameFile;
 use gleaner_bench_results::{BenchResults, Series, SeriesGroup, quantile};
 use lambda_path::LambdaPath;
-use model_process::{BenchModel, ModelProcess, digest, peak_mib, pss_mib};
+use model_process::{BenchModel, ModelProcess, digest};
 use python_program::{PythonProgram, PythonResult};
 
 pub use yolo_graph::{GraphScale, yolo_shaped};

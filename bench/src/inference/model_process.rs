@@ -5,7 +5,6 @@ use std::fs::File;
 use std::io::{BufRead, BufReader};
 use std::os::fd::{AsFd, OwnedFd};
 use std::os::unix::net::UnixStream;
-use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
 use gleaner_protocol::Handover;
@@ -97,22 +96,4 @@ impl Drop for ModelProcess {
         let _ = self.control.stop();
         let _ = self.child.wait();
     }
-}
-
-/// Peak of the resident memory of a process in MiB; NaN if unknown.
-pub(super) fn peak_mib(pid: u32) -> f64 {
-    memory_mib(pid, "status", "VmHWM:")
-}
-
-/// Memory of a process in MiB, its share of shared pages included (PSS); NaN if unknown.
-pub(super) fn pss_mib(pid: u32) -> f64 {
-    memory_mib(pid, "smaps_rollup", "Pss:")
-}
-
-fn memory_mib(pid: u32, file: &str, key: &str) -> f64 {
-    let path = Path::new("/proc").join(pid.to_string()).join(file);
-    let text = std::fs::read_to_string(path).unwrap_or_default();
-    let value = text.lines().find_map(|line| line.strip_prefix(key));
-    let kib = value.and_then(|value| value.trim().trim_end_matches(" kB").parse::<f64>().ok());
-    kib.map_or(f64::NAN, |kib| kib / 1024.0)
 }

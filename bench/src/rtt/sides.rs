@@ -1,7 +1,6 @@
 //! One side of a comparison: it is started, fed for one turn, and ended.
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
@@ -15,7 +14,7 @@ use super::bare::BareReader;
 use super::node::NodeSide;
 use super::workload::Workload;
 use crate::answers::{RttAnswer, RttReceiver};
-use crate::measure::Twin;
+use crate::measure::{Twin, pss_mib};
 
 /// A side.
 pub(super) enum Side {
@@ -204,7 +203,8 @@ impl RunningSide {
 
     fn memory_mb(&self) -> Option<f64> {
         let processes = self.processes();
-        (!processes.is_empty()).then(|| processes.into_iter().map(pss_mb).sum())
+        let mib = (!processes.is_empty()).then(|| processes.into_iter().map(pss_mib).sum::<f64>());
+        mib.filter(|mib| mib.is_finite()).map(|mib| mib * f64::from(1 << 20) / 1e6)
     }
 }
 
@@ -219,14 +219,4 @@ fn first(answers: &RttReceiver, side: &str) -> Vec<RttAnswer> {
         assert!(Instant::now() < deadline, "{side}: no answer arrives");
         sleep(Duration::from_millis(20));
     }
-}
-
-/// Returns the memory of a process in MB, with its share of what others use, too.
-fn pss_mb(pid: u32) -> f64 {
-    let path: PathBuf = ["/proc", &pid.to_string(), "smaps_rollup"].iter().collect();
-    let rollup = std::fs::read_to_string(path).unwrap_or_default();
-    let kib = rollup.lines().find_map(|line| {
-        line.strip_prefix("Pss:")?.trim().strip_suffix(" kB")?.trim().parse::<f64>().ok()
-    });
-    kib.unwrap_or(0.0) * 1024.0 / 1e6
 }
