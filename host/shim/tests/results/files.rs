@@ -200,7 +200,7 @@ fn lines_that_a_full_disk_refuses_are_counted_and_later_ones_are_written() {
     let script = format!(
         "woken; until grep -q 'are retried' {stderr_text}; do for n in {{1..200}}; do \
          log 1; done; done; : > {out}/log.jsonl; \
-         until grep -q 'written again' {stderr_text}; do log 2; done; asked",
+         until grep -q 'written again' {stderr_text}; do log 2; done; log 2; asked",
         stderr_text = stderr_text.display(),
         out = folder.out().display()
     );
