@@ -40,6 +40,11 @@ impl Checkout {
         Ok(Checkout { root, target, cargo })
     }
 
+    /// Another checkout, in `root`, with a target folder of its own.
+    pub(crate) fn other(&self, root: PathBuf) -> Checkout {
+        Checkout { target: root.join("target"), root, cargo: self.cargo.clone() }
+    }
+
     pub(crate) fn path(&self, relative: impl AsRef<Path>) -> PathBuf {
         self.root.join(relative)
     }

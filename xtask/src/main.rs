@@ -5,6 +5,7 @@
 //! each command has a file. Nothing here is installed.
 
 mod aarch64;
+mod bench;
 mod bless;
 mod checkout;
 mod deb;
@@ -16,6 +17,7 @@ mod fuzz;
 mod page;
 mod peers;
 mod player;
+mod revisions;
 mod setup;
 mod steps;
 mod suites;
@@ -37,7 +39,8 @@ const USAGE: &str = "usage: cargo xtask COMMAND
   bless    write the examples' decisions to expected.txt, and the generated files
   docs     fetch mdBook and build the pages as a book in target/book
   bench    run a benchmark: rtt, scale, isolation, cold-start, replay, record, drives, kernels,
-           inference or fleet; `compare A B` compares two results; see bench/README.md
+           inference or fleet; `compare A B` compares two results, and `compare BASE HEAD NAME`
+           measures two revisions in turns; see bench/README.md
   fleet    serve the cloud as three replicas on this machine, until ctrl-C; --install fetches its
            packages first, --kills N kills its programs in turn under simulated vehicles
   peers    build test programs on other DDS implementations; --install fetches their packages first
@@ -79,10 +82,7 @@ fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
         "test" => suites::run(&checkout),
         "bless" => bless::run(&checkout),
         "docs" => docs::run(&checkout),
-        "bench" if rest.first().is_some_and(|name| name == "fleet") => {
-            fleet_bench(&checkout, &rest[1..])
-        }
-        "bench" => bench(&checkout, rest),
+        "bench" => bench::run(&checkout, rest),
         "fleet" => fleet::run_scaled(&checkout, rest),
         "fuzz" => fuzz::run(&checkout, rest),
         "page" => page::run_flows(&checkout, rest),
@@ -96,48 +96,4 @@ fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
         }
         _ => Err(Failure::new(Exit::Usage, "no such command").with_help(USAGE)),
     }
-}
-
-/// Packages of the stand-in for ROS 2: name in pip, and name of the module.
-const STAND_IN: [(&str, &str); 3] =
-    [("cyclonedds", "cyclonedds.pub"), ("numpy", "numpy"), ("opencv-python-headless", "cv2")];
-
-/// Measures the cloud under a simulated fleet: without lambdas, and on all cores.
-fn fleet_bench(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
-    let mut steps = Steps::of(2);
-    steps.begin("programs (the first time this takes minutes)");
-    setup::programs(checkout)?;
-    let mut build = checkout.cargo();
-    steps::run(
-        build.args(["build", "--release", "--bin", "gleaner-fleet-bench"]),
-        "see the first error above",
-    )?;
-    steps.begin("measurements");
-    let mut bench = checkout.command(checkout.program("gleaner-fleet-bench"));
-    bench.args(arguments);
-    steps::run(&mut bench, "see the messages above").map(|()| Exit::Ok)
-}
-
-fn bench(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
-    let mut steps = Steps::of(setup::STEPS + 3);
-    setup::run(checkout, &mut steps, &checkout.lambdas(&FAMILIES))?;
-    steps.begin("programs for comparison");
-    venv::set_up_for_tests(checkout)?;
-    if arguments.first().is_some_and(|name| name == "rtt")
-        && let Err(failure) = venv::apart(checkout, &checkout.target().join("baselines"), &STAND_IN)
-    {
-        println!("without the stand-in for ROS 2:\n{failure}");
-    }
-    steps.begin("gleaner-bench");
-    let mut build = checkout.cargo();
-    // Only the binary is named: cargo selects features by the named packages, and other features
-    // would compile dependencies twice.
-    steps::run(
-        build.args(["build", "--release", "--bin", "gleaner-bench"]),
-        "see the first error above",
-    )?;
-    steps.begin("measurements");
-    let mut bench = checkout.command(checkout.program("gleaner-bench"));
-    bench.args(arguments);
-    steps::run(&mut bench, "see the messages above").map(|()| Exit::Ok)
 }

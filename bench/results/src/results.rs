@@ -113,17 +113,72 @@ impl BenchResults {
         Ok(())
     }
 
-    /// Reads the JSON file of a run, or the one in a folder.
+    /// Reads the results in a file or a folder. A folder with a folder for each of several runs has
+    /// the results of all, in the order of their names.
     ///
     /// # Errors
     ///
-    /// A file that cannot be read, or has no such results.
+    /// A file that cannot be read, or has no such results, or those of another benchmark than the
+    /// first.
     pub fn read(path: &Path) -> Result<Self, Failure> {
-        let path = if path.is_dir() { path.join("results.json") } else { path.to_owned() };
+        let own = path.join("results.json");
+        let mut runs = match fs::read_dir(path) {
+            Ok(entries) if !own.is_file() => {
+                entries.flatten().map(|entry| entry.path().join("results.json")).collect()
+            }
+            Ok(_) => vec![own.clone()],
+            Err(_) => vec![path.to_owned()],
+        };
+        runs.retain(|run| run.is_file());
+        runs.sort();
+        let Some((first, others)) = runs.split_first() else {
+            return Self::read_file(if path.is_dir() { &own } else { path });
+        };
+        let mut all = Self::read_file(first)?;
+        for run in others {
+            let other = Self::read_file(run)?;
+            if (&other.bench, other.is_quick) != (&all.bench, all.is_quick) {
+                let message = format!("`{}` is no run of the same benchmark", run.display());
+                return Err(Failure::new(Exit::Usage, message)
+                    .with_help("compare runs of one benchmark, all of them quick or none"));
+            }
+            all.add_run(other);
+        }
+        Ok(all)
+    }
+
+    /// Adds the values of another run to the rows and series of the same name.
+    fn add_run(&mut self, run: Self) {
+        for figure in run.figures {
+            let is_it = |own: &&mut Figure| (&own.name, &own.unit) == (&figure.name, &figure.unit);
+            match self.figures.iter_mut().find(is_it) {
+                Some(own) => own.values.extend(figure.values),
+                None => self.figures.push(figure),
+            }
+        }
+        for group in run.groups {
+            let is_it =
+                |own: &&mut SeriesGroup| (&own.name, &own.unit) == (&group.name, &group.unit);
+            let Some(own) = self.groups.iter_mut().find(is_it) else {
+                self.groups.push(group);
+                continue;
+            };
+            for series in group.series {
+                match own.series.iter_mut().find(|own| own.name == series.name) {
+                    Some(own) => own.values.extend(series.values),
+                    None => own.series.push(series),
+                }
+            }
+        }
+    }
+
+    fn read_file(path: &Path) -> Result<Self, Failure> {
         let failed = |error: &dyn std::error::Error| {
             let message = format!("cannot read the results `{}`", path.display());
-            Failure::caused_by(Exit::Usage, message, error)
-                .with_help("name a folder with results, or the results.json in it")
+            Failure::caused_by(Exit::Usage, message, error).with_help(
+                "name a folder with results, or the results.json in it; revisions are compared \
+                     with a third argument, the name of a benchmark",
+            )
         };
         let text = fs::read(&path).map_err(|error| failed(&error))?;
         let results: Self = serde_json::from_slice(&text).map_err(|error| failed(&error))?;
@@ -171,6 +226,28 @@ pub(crate) mod tests {
         });
         results.notes.push("A note.".to_owned());
         results
+    }
+
+    #[test]
+    fn several_runs_are_read_as_one() {
+        let folder = TestFolder::new();
+        let path = folder.path("base");
+        let mut other = example(0.5);
+        other.figures.push(Figure::without_goal("new", "s", &[1.0]));
+        for (name, run) in [("002", &other), ("001", &example(0.0))] {
+            run.store(&path.join(name)).unwrap();
+        }
+        let all = BenchResults::read(&path).unwrap();
+        assert_eq!(all.figures.len(), 2);
+        assert_eq!(all.figures[0].values.len(), 6);
+        let wasm = &all.groups[0].series[1].values;
+        assert_eq!((wasm.len(), wasm[0], wasm[200]), (400, 1.5, 2.0));
+        other.bench = "scale".to_owned();
+        other.store(&path.join("003")).unwrap();
+        let error = BenchResults::read(&path).unwrap_err().to_string();
+        assert!(error.contains("003") && error.contains("same benchmark"), "{error}");
+        let error = BenchResults::read(folder.root()).unwrap_err().to_string();
+        assert!(error.contains("results.json"), "{error}");
     }
 
     #[test]

@@ -1,0 +1,74 @@
+//! `cargo xtask bench`: builds what a benchmark needs, and runs it.
+
+use std::ffi::OsString;
+
+use gleaner_base::{Exit, Failure};
+
+use crate::checkout::{Checkout, FAMILIES};
+use crate::revisions;
+use crate::setup;
+use crate::steps::{self, Steps};
+use crate::venv;
+
+/// Packages of the stand-in for ROS 2: name in pip, and name of the module.
+const STAND_IN: [(&str, &str); 3] =
+    [("cyclonedds", "cyclonedds.pub"), ("numpy", "numpy"), ("opencv-python-headless", "cv2")];
+
+/// Runs the benchmark that the first argument names, or compares results.
+pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
+    let name = arguments.first().and_then(|name| name.to_str()).unwrap_or_default();
+    match (name, arguments) {
+        ("fleet", [_, rest @ ..]) => fleet(checkout, rest),
+        ("compare", [_, base, head, name, rest @ ..]) => {
+            let [base_runs, head_runs] = revisions::measure(checkout, [base, head], name, rest)?;
+            compare(checkout, &["compare".into(), base_runs.into(), head_runs.into()])
+        }
+        ("compare", _) => compare(checkout, arguments),
+        _ => measure(checkout, name, arguments),
+    }
+}
+
+/// Measures the cloud under a simulated fleet: without lambdas, and on all cores.
+fn fleet(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
+    let mut steps = Steps::of(2);
+    steps.begin("programs (the first time this takes minutes)");
+    setup::programs(checkout)?;
+    build(checkout, "gleaner-fleet-bench")?;
+    steps.begin("measurements");
+    start(checkout, "gleaner-fleet-bench", arguments)
+}
+
+fn measure(checkout: &Checkout, name: &str, arguments: &[OsString]) -> Result<Exit, Failure> {
+    let mut steps = Steps::of(setup::STEPS + 3);
+    setup::run(checkout, &mut steps, &checkout.lambdas(&FAMILIES))?;
+    steps.begin("programs for comparison");
+    venv::set_up_for_tests(checkout)?;
+    if name == "rtt"
+        && let Err(failure) = venv::apart(checkout, &checkout.target().join("baselines"), &STAND_IN)
+    {
+        println!("without the stand-in for ROS 2:\n{failure}");
+    }
+    steps.begin("gleaner-bench");
+    build(checkout, "gleaner-bench")?;
+    steps.begin("measurements");
+    start(checkout, "gleaner-bench", arguments)
+}
+
+/// Compares results that were stored.
+fn compare(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
+    build(checkout, "gleaner-bench")?;
+    start(checkout, "gleaner-bench", arguments)
+}
+
+fn build(checkout: &Checkout, program: &str) -> Result<(), Failure> {
+    let mut build = checkout.cargo();
+    // Only the binary is named: cargo selects features by the named packages, and other features
+    // would compile dependencies twice.
+    steps::run(build.args(["build", "--release", "--bin", program]), "see the first error above")
+}
+
+fn start(checkout: &Checkout, program: &str, arguments: &[OsString]) -> Result<Exit, Failure> {
+    let mut bench = checkout.command(checkout.program(program));
+    bench.args(arguments);
+    steps::run(&mut bench, "see the messages above").map(|()| Exit::Ok)
+}

@@ -1,0 +1,179 @@
+//! `cargo xtask bench compare BASE HEAD NAME`: measures two revisions in turns.
+//!
+//! Each has a checkout of its own below `target/revisions`, with its own build. It is kept, so that
+//! only the first measurement of a revision takes the time of a build.
+
+use std::ffi::{OsStr, OsString};
+use std::fs::{self, File};
+use std::path::{Path, PathBuf};
+
+use gleaner_base::{Exit, Failure};
+
+use crate::checkout::Checkout;
+use crate::steps::{self, Steps};
+
+const USAGE: &str =
+    "usage: cargo xtask bench compare BASE HEAD NAME [--rounds N] [options of NAME]";
+
+/// Runs of each revision. Rows with fewer than five values get no verdict.
+const ROUNDS: usize = 5;
+
+/// Benchmarks that need gleaner-player, which is not built with the other programs.
+const LIVE: [&str; 3] = ["rtt", "scale", "isolation"];
+
+/// A revision, and where its runs are.
+struct Revision {
+    /// As it was named.
+    name: String,
+    commit: String,
+    checkout: Checkout,
+    runs: PathBuf,
+}
+
+/// Measures two revisions by the benchmark `name`, and returns the folders with their runs.
+pub(crate) fn measure(
+    checkout: &Checkout,
+    names: [&OsStr; 2],
+    name: &OsStr,
+    rest: &[OsString],
+) -> Result<[PathBuf; 2], Failure> {
+    let (rounds, options) = rounds(rest)?;
+    let folder = checkout.target().join("revisions");
+    fs::create_dir_all(&folder).map_err(|error| cannot_use(&folder, &error))?;
+    let lock = File::create(folder.join("lock")).map_err(|error| cannot_use(&folder, &error))?;
+    if lock.try_lock().is_err() {
+        let message = "another comparison of revisions runs in this checkout";
+        return Err(Failure::new(Exit::Usage, message)
+            .with_help("wait for its end: they would disturb each other"));
+    }
+    let runs = checkout.target().join("bench").join("compare");
+    let revision = |revision: &OsStr, side: &str| -> Result<Revision, Failure> {
+        let commit = commit(checkout, revision)?;
+        let own = checkout.other(folder.join(&commit[..12]));
+        let name = revision.to_string_lossy().into_owned();
+        Ok(Revision { name, commit, checkout: own, runs: runs.join(side) })
+    };
+    let sides = [revision(names[0], "base")?, revision(names[1], "head")?];
+    if sides[0].commit == sides[1].commit {
+        let message = format!("`{}` and `{}` are one revision", sides[0].name, sides[1].name);
+        return Err(Failure::new(Exit::Usage, message)
+            .with_help("commit the change that is to be measured"));
+    }
+    warn_of_changes(checkout)?;
+    let mut steps = Steps::of(2 + 2 * rounds);
+    for side in &sides {
+        steps.begin(&format!("{}, built in {}", side.name, side.checkout.path("").display()));
+        side.prepare(checkout, name)?;
+    }
+    for round in 0..rounds {
+        // Each begins in every second round.
+        let order = if round % 2 == 0 { [0, 1] } else { [1, 0] };
+        for index in order {
+            let side = &sides[index];
+            steps.begin(&format!("{}, run {} of {rounds}", side.name, round + 1));
+            side.run(name, options, &side.runs.join(format!("{:03}", round + 1)))?;
+        }
+    }
+    println!(
+        "A is {} ({:.12}), B is {} ({:.12})",
+        sides[0].name, sides[0].commit, sides[1].name, sides[1].commit
+    );
+    Ok(sides.map(|side| side.runs))
+}
+
+impl Revision {
+    /// Checks the revision out, and builds all that the benchmark needs: a short run does that, and
+    /// shows that this revision can be measured.
+    fn prepare(&self, checkout: &Checkout, name: &OsStr) -> Result<(), Failure> {
+        let folder = self.checkout.path("");
+        if folder.join(".git").is_file() {
+            // Also after an interrupted checkout.
+            let mut restore = self.checkout.command("git");
+            restore.args(["checkout", "--quiet", "--force", "--detach", &self.commit]);
+            steps::run(&mut restore, "see the message of git above")?;
+        } else {
+            let mut add = checkout.command("git");
+            add.args(["worktree", "add", "--force", "--detach"]).arg(&folder).arg(&self.commit);
+            steps::run(&mut add, "see the message of git above")?;
+        }
+        let trial = self.checkout.target().join("bench/trial");
+        for old in [&self.runs, &trial] {
+            match fs::remove_dir_all(old) {
+                Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+                    return Err(cannot_use(old, &error));
+                }
+                _ => {}
+            }
+        }
+        if LIVE.iter().any(|live| name == *live) {
+            let mut player = self.checkout.cargo();
+            steps::run(player.args(["xtask", "player"]), "see the message above")?;
+        }
+        self.run(name, &["--quick".into()], &trial)
+    }
+
+    /// Runs the benchmark; its results are in `out` afterwards.
+    fn run(&self, name: &OsStr, options: &[OsString], out: &Path) -> Result<(), Failure> {
+        let results = out.join("results.json");
+        let mut bench = self.checkout.cargo();
+        bench.args(["xtask", "bench"]).arg(name).args(options).arg("--out").arg(out);
+        let ended = steps::run(&mut bench, "see the messages above");
+        // A goal that is not met is no error here.
+        if results.is_file() {
+            return Ok(());
+        }
+        let message = format!("`{}` has no results of {}", self.name, name.display());
+        let failure = Failure::new(Exit::Internal, message).with_help(
+            "see its messages above; revisions before `cargo xtask bench NAME --out DIR` cannot be \
+             compared",
+        );
+        Err(match ended {
+            Err(cause) => Failure { causes: cause.causes, ..failure },
+            Ok(()) => failure,
+        })
+    }
+}
+
+/// Splits off `--rounds N`.
+fn rounds(rest: &[OsString]) -> Result<(usize, &[OsString]), Failure> {
+    match rest {
+        [flag, number, options @ ..] if flag == "--rounds" => {
+            let number = number.to_str().and_then(|number| number.parse().ok());
+            let number = number.filter(|number| (1..=1000).contains(number));
+            let refused = || {
+                Failure::new(Exit::Usage, "`--rounds` takes a number from 1 to 1000")
+                    .with_help(USAGE)
+            };
+            Ok((number.ok_or_else(refused)?, options))
+        }
+        _ => Ok((ROUNDS, rest)),
+    }
+}
+
+/// The whole name of a commit.
+fn commit(checkout: &Checkout, revision: &OsStr) -> Result<String, Failure> {
+    let mut text = revision.to_owned();
+    text.push("^{commit}");
+    let mut parse = checkout.command("git");
+    parse.args(["rev-parse", "--verify", "--quiet", "--end-of-options"]).arg(text);
+    let commit =
+        steps::output(&mut parse, "name a commit, a branch or a tag").map_err(|failure| {
+            let message = format!("`{}` is no revision of this repository", revision.display());
+            Failure { message, ..failure }.with_help(USAGE)
+        })?;
+    Ok(commit.trim().to_owned())
+}
+
+fn warn_of_changes(checkout: &Checkout) -> Result<(), Failure> {
+    let mut status = checkout.command("git");
+    status.args(["status", "--porcelain", "--untracked-files=no"]);
+    if !steps::output(&mut status, "see the message of git above")?.is_empty() {
+        println!("changes that are not committed are not measured");
+    }
+    Ok(())
+}
+
+fn cannot_use(path: &Path, error: &std::io::Error) -> Failure {
+    Failure::caused_by(Exit::Internal, format!("cannot use `{}`", path.display()), error)
+        .with_help("the target folder has to be writable")
+}
