@@ -1,6 +1,7 @@
 //! The cloud is killed again and again under a fleet that sends records and gets releases in waves.
 
 use std::collections::BTreeMap;
+use std::io;
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
@@ -79,12 +80,9 @@ pub async fn figures(
     Ok(figures)
 }
 
-/// Measures `count` vehicles of a running cloud, of which others kill parts for `time`.
-pub async fn figures_of(
-    running: &RunningCloud,
-    count: usize,
-    time: Duration,
-) -> Result<Vec<Figure>, String> {
+/// Measures `count` vehicles of a running cloud, of which others kill parts until standard input
+/// ends.
+pub async fn figures_of(running: &RunningCloud, count: usize) -> Result<Vec<Figure>, String> {
     let token = Administrator::login(running.people, &running.code).await?;
     let identities = enrol_all(running.people, &token, count).await?;
     let (simulation, vehicles) = start_all(&identities, running.cloud, PAUSE_MAX);
@@ -96,7 +94,8 @@ pub async fn figures_of(
     simulation.is_restarting.store(true, Relaxed);
     let rollouts = Rollouts::start(running.people, &token, count);
     println!("all vehicles are connected");
-    sleep(time).await;
+    let ended = tokio::task::spawn_blocking(|| io::copy(&mut io::stdin(), &mut io::sink()));
+    let _ = ended.await.map_err(|error| error.to_string())?;
     let members = FleetMembers { people: running.people, token: &token, identities: &identities };
     let figures = finish(&simulation, vehicles, rollouts, &members).await?;
     figures.iter().for_each(|figure| println!("{figure}"));

@@ -48,7 +48,7 @@ struct Args {
     /// Number of times that the cloud is killed, under 1,000 vehicles
     #[arg(long, value_name = "N")]
     kills: Option<usize>,
-    /// Address for people of a running cloud, of which others kill parts for --seconds
+    /// Address for people of a running cloud, of which others kill parts until standard input ends
     #[arg(long, value_name = "ADDRESS", requires_all = ["cloud", "code"])]
     people: Option<SocketAddr>,
     /// Its address for vehicles
@@ -92,8 +92,7 @@ fn main() -> ExitCode {
 async fn measure(args: &Args) -> Result<Vec<Figure>, String> {
     if let (Some(people), Some(cloud), Some(code)) = (args.people, args.cloud, &args.code) {
         let running = RunningCloud { people, cloud, code: code.clone() };
-        let time = Duration::from_secs(args.seconds.unwrap_or(60));
-        return chaos::figures_of(&running, args.vehicles.unwrap_or(1000), time).await;
+        return chaos::figures_of(&running, args.vehicles.unwrap_or(1000)).await;
     }
     let by_hand = |quick: u64, full: u64| if args.quick { quick } else { full };
     let vehicles = args.vehicles.unwrap_or(if args.quick { 1000 } else { 10_000 });

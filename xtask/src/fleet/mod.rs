@@ -109,12 +109,9 @@ fn kill(
     let failed =
         |error| Failure::caused_by(Exit::Internal, "cannot run gleaner-fleet-bench", &error);
     let mut bench: Command = checkout.command(checkout.program("gleaner-fleet-bench"));
-    // The last kill has its time, too.
-    let seconds = (options.kills + 1) * options.every;
     bench.args(["--people", &cloud.people.to_string(), "--cloud", &cloud.vehicles.to_string()]);
     bench.args(["--code", &cloud.code, "--vehicles", &options.vehicles.to_string()]);
-    bench.args(["--seconds", &seconds.to_string()]);
-    let mut bench = bench.stdout(Stdio::piped()).spawn().map_err(failed)?;
+    let mut bench = bench.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().map_err(failed)?;
     let output = bench.stdout.take();
     let output =
         output.ok_or_else(|| Failure::new(Exit::Internal, "gleaner-fleet-bench has no output"))?;
@@ -129,6 +126,9 @@ fn kill(
                 }
                 println!("kill {}: {}", number + 1, cloud.kill_and_start(number)?);
             }
+            // The last kill has its time, too.
+            cloud.wait(Duration::from_secs(options.every));
+            drop(bench.stdin.take());
         }
     }
     let ended = bench.wait().map_err(failed)?;
