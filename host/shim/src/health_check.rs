@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use gleaner_protocol::{KillReason, Killed, Phase};
 use gleaner_vitals::Pulse;
-use gleaner_vitals::usage::{ProcessUsage, data_limit};
+use gleaner_vitals::usage::{StatusFile, data_limit};
 
 /// Interval between two checks that both find a runtime late, before it is killed: after a suspend
 /// of the machine it has this long to return.
@@ -28,6 +28,8 @@ const UNCOUNTED: u64 = 64 << 20;
 /// State of the checks of one process.
 pub(crate) struct HealthCheck {
     pid: u32,
+    /// `None` if the process has ended already, or `/proc` does not show it.
+    status: Option<StatusFile>,
     late: Sustained,
     stopped: Sustained,
     excess: Sustained,
@@ -38,6 +40,7 @@ impl HealthCheck {
     pub(crate) fn of(pid: u32) -> Self {
         Self {
             pid,
+            status: StatusFile::open(Some(pid)).ok(),
             late: Sustained::default(),
             stopped: Sustained::default(),
             excess: Sustained::default(),
@@ -63,7 +66,7 @@ impl HealthCheck {
     /// Checks the process in `/proc`, which the runtime cannot forge.
     fn check_proc(&mut self, pulse: &Pulse) -> Option<Killed> {
         // A process that has just ended has no memory.
-        let usage = ProcessUsage::of(Some(self.pid))?;
+        let usage = self.status.as_ref()?.usage()?;
         if let Some(stopped) =
             self.stopped.seen(usage.is_stopped).filter(|stopped| *stopped >= MAX_STOPPED)
         {
@@ -77,7 +80,8 @@ impl HealthCheck {
         }
         // The kernel's number, which the process cannot raise. Pages that it no longer counts, such
         // as those made read-only, are still in memory.
-        if let Some(limit) = data_limit(self.pid)
+        if usage.held > UNCOUNTED
+            && let Some(limit) = data_limit(self.pid)
             && usage.held > limit.saturating_add(UNCOUNTED)
         {
             return Some(pulse.killed(KillReason::Memory { used: usage.held, allowed: limit }));
