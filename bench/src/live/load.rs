@@ -21,10 +21,19 @@ pub(super) struct Load<'a> {
     pub name: String,
     /// Lambdas of `bench/lambdas`, and how many of each.
     pub lambdas: &'a [(&'a str, usize)],
+    /// Further IMU topics that each of them reads, as [`more_imu`] names them.
+    pub more_topics: u32,
     pub kind: Twin,
     /// Arguments of each player.
     pub players: &'a [&'a [&'a str]],
     pub seconds: u32,
+    /// True if packets are dropped, so that samples may be lost.
+    pub is_lossy: bool,
+}
+
+/// The topic of a further IMU.
+pub(super) fn more_imu(number: u32) -> String {
+    format!("/imu/more_{number}")
 }
 
 /// The costs of a load.
@@ -34,6 +43,10 @@ pub(super) struct LoadCosts {
     pub(super) all_percent: f64,
     /// Median wake latency.
     pub(super) wake_us: f64,
+    /// CPU time of a lambda's process for each of its wakes.
+    pub(super) wake_cpu_us: f64,
+    /// Samples that were not received, in % of those that were sent.
+    pub(super) missing_percent: f64,
 }
 
 /// The processes of a run, with shares of a core in % and own memory in MB.
@@ -54,7 +67,11 @@ impl Load<'_> {
     pub(super) fn measure(&self, figures: &mut Vec<Figure>) -> LoadCosts {
         let copies = self.lambdas.iter().flat_map(|(lambda, count)| {
             let folder = format!("bench/lambdas/{lambda}/{}", self.kind.folder());
-            (0..*count).map(move |index| LambdaCopy::named(&folder, &format!("{lambda}-{index}")))
+            (0..*count).map(move |index| {
+                LambdaCopy::changed_and_named(&folder, &format!("{lambda}-{index}"), |manifest| {
+                    manifest + &more_inputs(self.more_topics)
+                })
+            })
         });
         let copies: Vec<LambdaCopy> = copies.collect();
         let folders: Vec<&Path> = copies.iter().map(LambdaCopy::path).collect();
@@ -95,19 +112,22 @@ impl Load<'_> {
         } else {
             names.iter().map(|name| finished.ended_of(name).expect("it has ended")).collect()
         };
-        self.receptions(&ended, &sent, figures);
+        let missing_percent = self.receptions(&ended, &sent, figures);
         let wake_us = self.latencies(&ended, figures);
         let (ingress_percent, all_percent) = self.costs(&first, &last, span, ready_ms, figures);
-        LoadCosts { ingress_percent, all_percent, wake_us }
+        let wakes: u64 = ended.iter().map(|live| live.wakes).sum();
+        let busy_s = (all_percent - ingress_percent) / 100.0 * f64::from(self.seconds);
+        let wake_cpu_us = 1e6 * busy_s / wakes as f64;
+        LoadCosts { ingress_percent, all_percent, wake_us, wake_cpu_us, missing_percent }
     }
 
-    /// Adds what arrived of each topic, and what did not.
+    /// Adds what arrived of each topic, and what did not; returns the latter in % of all.
     fn receptions(
         &self,
         ended: &[LiveStatus],
         sent: &BTreeMap<String, u64>,
         figures: &mut Vec<Figure>,
-    ) {
+    ) -> f64 {
         let (mut missing, mut refused) = (Vec::new(), Vec::new());
         for topic in ended.iter().flat_map(|live| &live.topics) {
             let counted = topic.no_slot + topic.too_big + topic.malformed;
@@ -123,12 +143,15 @@ impl Load<'_> {
             self.name,
             if granted { "" } else { " (not granted)" }
         );
-        figures.push(if granted {
+        figures.push(if granted && !self.is_lossy {
             Figure::at_most(&name, "samples", 0.0, &missing)
         } else {
             Figure::without_goal(&name, "samples", &missing)
         });
         self.add("counted as lost or refused", "samples", &refused, figures);
+        let expected: u64 =
+            ended.iter().flat_map(|live| &live.topics).map(|topic| sent[&topic.topic]).sum();
+        100.0 * missing.iter().sum::<f64>() / expected as f64
     }
 
     /// Adds the costs; returns those of the ingress and of all processes, in % of a core.
@@ -212,6 +235,18 @@ impl Process {
     fn share(&self, later: &Self, span: Duration) -> f64 {
         100.0 * later.cpu_ns.saturating_sub(self.cpu_ns) as f64 / span.as_nanos() as f64
     }
+}
+
+/// Inputs of further IMU topics, for a manifest.
+fn more_inputs(count: u32) -> String {
+    let input = |number| {
+        format!(
+            "\n[[input]]\nname = \"more_{number}\"\ntopic = \"{}\"\ntype = \
+             \"sensor_msgs/msg/Imu\"\ndepth = 512\n",
+            more_imu(number)
+        )
+    };
+    (1..=count).map(input).collect()
 }
 
 fn read(pid: u32, name: &str) -> String {

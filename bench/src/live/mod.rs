@@ -3,6 +3,7 @@
 
 mod busy_cores;
 mod load;
+mod packet_loss;
 mod scale;
 
 use std::fs::{File, TryLockError};

@@ -2,11 +2,15 @@
 
 use gleaner_bench_results::{BenchResults, Figure, Growth, GrowthCurve};
 
-use super::load::Load;
+use super::load::{Load, LoadCosts, more_imu};
+use super::packet_loss::PacketLoss;
 use crate::measure::Twin;
 
 /// Remap of the second camera of `bench/lambdas/rig`.
 const REAR: &str = "/camera/synthetic/image_raw:=/camera/rear/image_raw";
+
+/// Most that the CPU time of a wake grows with the number of topics or lambdas.
+const FLAT: f64 = 1.2;
 
 /// Name, lambdas, players and seconds of a load.
 type LoadArgs<'a> = (&'a str, &'a [(&'a str, usize)], &'a [&'a [&'a str]], u32);
@@ -34,55 +38,76 @@ pub fn loads(quick: bool, results: &mut BenchResults) {
     for (name, lambdas, players, long) in single {
         let seconds = seconds(long);
         let name = name.to_owned();
-        Load { name, lambdas, kind: Twin::Rust, players, seconds }.measure(&mut results.figures);
+        let (more_topics, kind, is_lossy) = (0, Twin::Rust, false);
+        let load = Load { name, lambdas, more_topics, kind, players, seconds, is_lossy };
+        load.measure(&mut results.figures);
     }
     let seconds = seconds(16);
+    let imu = |rate: u32| vec!["--imu".to_owned(), rate.to_string()];
+    let full_hd = |rate: u32| raw_camera("1920x1080", rate);
+    let one = |lambda, player| ScaleLoad::of(lambda, 1, vec![player]);
     let cameras = |rate: u32| Scale {
         name: format!("1080p at {rate} Hz"),
         of: "lambdas",
         places: if quick { &[1, 4] } else { &[1, 4, 8, 16] },
-        load: Box::new(move |count| ScaleLoad {
-            lambda: "camera",
-            count: count as usize,
-            player: raw_camera("1920x1080", rate),
-        }),
-        seconds,
+        is_flat: true,
+        load: Box::new(move |count| ScaleLoad::of("camera", count, vec![full_hd(rate)])),
     };
     let rates = if quick { &[30][..] } else { &[10, 30] };
     let mut scales: Vec<Scale> = rates.iter().map(|rate| cameras(*rate)).collect();
-    let imu = |rate: u32| vec!["--imu".to_owned(), rate.to_string()];
     scales.push(Scale {
         name: "IMU at 1 kHz".to_owned(),
         of: "lambdas",
         places: if quick { &[4] } else { &[1, 10, 25, 50] },
-        load: Box::new(move |count| ScaleLoad {
-            lambda: "imu",
-            count: count as usize,
-            player: imu(1000),
+        is_flat: true,
+        load: Box::new(move |count| ScaleLoad::of("imu", count, vec![imu(1000)])),
+    });
+    scales.push(Scale {
+        name: "one lambda on IMUs at 100 Hz, woken by the first".to_owned(),
+        of: "topics",
+        places: if quick { &[2] } else { &[1, 2, 4, 8, 16] },
+        is_flat: true,
+        load: Box::new(move |topics| {
+            let remap = |number| {
+                vec!["--remap".to_owned(), format!("/imu/synthetic:={}", more_imu(number))]
+            };
+            let more = (1..topics).map(|number| [imu(100), remap(number)].concat());
+            let players = std::iter::once(imu(100)).chain(more).collect();
+            ScaleLoad { more_topics: topics - 1, ..ScaleLoad::of("imu", 1, players) }
         }),
-        seconds,
     });
     if !quick {
         scales.push(Scale {
             name: "one lambda on an IMU".to_owned(),
             of: "samples per second",
             places: &[100, 500, 1000, 2000, 5000],
-            load: Box::new(move |rate| ScaleLoad { lambda: "imu", count: 1, player: imu(rate) }),
-            seconds,
+            is_flat: false,
+            load: Box::new(move |rate| one("imu", imu(rate))),
         });
         scales.push(Scale {
             name: "one lambda on a camera at 10 Hz".to_owned(),
             of: "rows of an image of 16:9",
             places: &[720, 1080, 1440, 2160],
-            load: Box::new(|rows| ScaleLoad {
-                lambda: "camera",
-                count: 1,
-                player: raw_camera(&format!("{}x{rows}", rows * 16 / 9), 10),
+            is_flat: false,
+            load: Box::new(move |rows| {
+                one("camera", raw_camera(&format!("{}x{rows}", rows * 16 / 9), 10))
             }),
-            seconds,
         });
+        let of_loss = |name: &str, lambda: &'static str, player: Vec<String>| Scale {
+            name: name.to_owned(),
+            of: "dropped packets in 1,000",
+            places: &[0, 1, 10, 50],
+            is_flat: false,
+            load: Box::new(move |dropped| ScaleLoad { dropped, ..one(lambda, player.clone()) }),
+        };
+        if let Err(why) = PacketLoss::of(0) {
+            results.notes.push(format!("loss of packets is not measured: {why}"));
+        } else {
+            scales.push(of_loss("one lambda on an IMU at 1 kHz", "imu", imu(1000)));
+            scales.push(of_loss("one lambda on 1080p at 10 Hz", "camera", full_hd(10)));
+        }
     }
-    scales.iter().for_each(|scale| scale.measure(results));
+    scales.iter().for_each(|scale| scale.measure(seconds, results));
 }
 
 /// Arguments of a player of raw images.
@@ -96,56 +121,105 @@ struct Scale {
     /// The number, in plural.
     of: &'static str,
     places: &'static [u32],
+    /// True if the CPU time of a wake should not depend on the number.
+    is_flat: bool,
     load: Box<dyn Fn(u32) -> ScaleLoad>,
-    seconds: u32,
 }
 
 /// The load at one number.
 struct ScaleLoad {
     /// A lambda of `bench/lambdas`, and how many of it run.
     lambda: &'static str,
-    count: usize,
-    /// Arguments of the player.
-    player: Vec<String>,
+    count: u32,
+    more_topics: u32,
+    /// Arguments of each player.
+    players: Vec<Vec<String>>,
+    /// Packets of 1,000 that are dropped.
+    dropped: u32,
 }
+
+impl ScaleLoad {
+    fn of(lambda: &'static str, count: u32, players: Vec<Vec<String>>) -> Self {
+        Self { lambda, count, more_topics: 0, players, dropped: 0 }
+    }
+
+    fn measure(
+        &self,
+        name: &str,
+        kind: Twin,
+        seconds: u32,
+        figures: &mut Vec<Figure>,
+    ) -> LoadCosts {
+        let _loss = PacketLoss::of(self.dropped).expect("packets could be dropped before");
+        let players: Vec<Vec<&str>> =
+            self.players.iter().map(|player| player.iter().map(String::as_str).collect()).collect();
+        let players: Vec<&[&str]> = players.iter().map(Vec::as_slice).collect();
+        let load = Load {
+            name: name.to_owned(),
+            lambdas: &[(self.lambda, self.count as usize)],
+            more_topics: self.more_topics,
+            kind,
+            players: &players,
+            seconds,
+            is_lossy: self.dropped > 0,
+        };
+        load.measure(figures)
+    }
+}
+
+/// What a scale measures: name, unit and value.
+type Measured = (&'static str, &'static str, fn(&LoadCosts) -> f64);
+
+const MEASURED: [Measured; 5] = [
+    ("CPU time of all", "% of a core", |costs| costs.all_percent),
+    ("CPU time of the ingress", "% of a core", |costs| costs.ingress_percent),
+    ("CPU time of a lambda's process for a wake", "us", |costs| costs.wake_cpu_us),
+    ("wake latency, p50", "us", |costs| costs.wake_us),
+    ("samples not received", "%", |costs| costs.missing_percent),
+];
 
 impl Scale {
     /// Measures each place with lambdas of both kinds.
-    fn measure(&self, results: &mut BenchResults) {
-        let (mut cpu, mut wakes) = (Vec::new(), Vec::new());
+    fn measure(&self, seconds: u32, results: &mut BenchResults) {
+        let mut curves: [Vec<GrowthCurve>; MEASURED.len()] = Default::default();
         for kind in [Twin::Rust, Twin::Python] {
-            let (mut all, mut ingress, mut wake) = (Vec::new(), Vec::new(), Vec::new());
-            for place in self.places {
-                let ScaleLoad { lambda, count, player } = (self.load)(*place);
-                let player: Vec<&str> = player.iter().map(String::as_str).collect();
+            let measured: Vec<(u32, LoadCosts)> = self
+                .places
+                .iter()
+                .map(|place| {
+                    let name = format!("{}, {place} {} in {kind}", self.name, self.of);
+                    let load = (self.load)(*place);
+                    let costs = load.measure(&name, kind, seconds, &mut results.figures);
+                    (*place, costs)
+                })
+                .collect();
+            let (first, others) = measured.split_first().expect("a scale has places");
+            for (place, costs) in others.iter().filter(|_| self.is_flat && first.0 == 1) {
                 let name = format!("{}, {place} {} in {kind}", self.name, self.of);
-                let (lambdas, players) = (&[(lambda, count)][..], &[&player[..]][..]);
-                let load =
-                    Load { name: name.clone(), lambdas, kind, players, seconds: self.seconds };
-                let costs = load.measure(&mut results.figures);
-                let at = f64::from(*place);
-                all.push([at, costs.all_percent]);
-                wake.push([at, costs.wake_us]);
-                ingress.push([at, costs.ingress_percent]);
+                let mut against = |what: &str, most: f64, of: fn(&LoadCosts) -> f64| {
+                    let name = format!("{name}: {what}, against that of one");
+                    let ratio = of(costs) / of(&first.1);
+                    results.figures.push(Figure::at_most(&name, "times", most, &[ratio]));
+                };
+                against("CPU time of a wake", FLAT, |costs| costs.wake_cpu_us);
                 // One reception serves all lambdas.
-                if count > 1 && ingress[0][0] == 1.0 {
-                    let ratio = costs.ingress_percent / ingress[0][1];
-                    let name = format!("{name}: ingress, against that of one");
-                    results.figures.push(Figure::at_most(&name, "times", 1.1, &[ratio]));
+                if self.of == "lambdas" {
+                    against("ingress", 1.1, |costs| costs.ingress_percent);
                 }
             }
-            let curve = |name: String, points| GrowthCurve { name, points };
-            cpu.push(curve(format!("all, {kind}"), all));
-            cpu.push(curve(format!("ingress, {kind}"), ingress));
-            wakes.push(curve(kind.to_string(), wake));
+            for (curves, (.., of)) in curves.iter_mut().zip(MEASURED) {
+                let points =
+                    measured.iter().map(|(place, costs)| [f64::from(*place), of(costs)]).collect();
+                curves.push(GrowthCurve { name: kind.to_string(), points });
+            }
         }
-        let growth = |what: &str, unit: &str, curves| Growth {
-            name: format!("{}: {what}", self.name),
-            of: self.of.to_owned(),
-            unit: unit.to_owned(),
-            curves,
-        };
-        results.growths.push(growth("CPU time", "% of a core", cpu));
-        results.growths.push(growth("wake latency, p50", "us", wakes));
+        for ((what, unit, _), curves) in MEASURED.into_iter().zip(curves) {
+            results.growths.push(Growth {
+                name: format!("{}: {what}", self.name),
+                of: self.of.to_owned(),
+                unit: unit.to_owned(),
+                curves,
+            });
+        }
     }
 }
