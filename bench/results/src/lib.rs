@@ -5,7 +5,7 @@
 //!   and as a page with plots.
 //! - [`Summary`] has the statistics of a series, and [`MeasuredDifference`] compares two.
 //! - [`Comparison`] compares two runs.
-//! - [`Machine`] is where a run took place.
+//! - [`Machine`] is where a run took place, and [`PowerMeter`] measures the power that it takes.
 
 mod comparison;
 mod figure;
@@ -13,6 +13,7 @@ mod growth;
 mod machine;
 mod markdown;
 mod page;
+mod power;
 mod results;
 mod statistics;
 #[cfg(test)]
@@ -23,5 +24,6 @@ pub use comparison::Comparison;
 pub use figure::{Figure, Goal};
 pub use growth::{Growth, GrowthCurve};
 pub use machine::Machine;
+pub use power::PowerMeter;
 pub use results::{BenchResults, Reception, Series, SeriesGroup};
 pub use statistics::{MeasuredDifference, Summary, quantile};

@@ -16,7 +16,9 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use clap::Args;
-use gleaner_bench_results::{BenchResults, Reception, Series, SeriesGroup, quantile};
+use gleaner_bench_results::{
+    BenchResults, Growth, GrowthCurve, PowerMeter, Reception, Series, SeriesGroup, quantile,
+};
 use gleaner_dds::{Dds, DdsOptions};
 
 use crate::answers::RttReceiver;
@@ -64,6 +66,10 @@ pub fn measure(quick: bool, options: &RttOptions, results: &mut BenchResults) {
          the stamp of the answer, just before it is sent."
             .to_owned(),
     );
+    if !PowerMeter::of_this_machine().is_available() {
+        let note = "Power is not measured: no RAPL and no INA3221 can be read on this machine.";
+        results.notes.push(note.to_owned());
+    }
     let workloads = match &options.workload[..] {
         [] if quick => vec![Workload::Empty, Workload::ImuFft, Workload::Brake720],
         [] => Workload::ALL.to_vec(),
@@ -105,6 +111,8 @@ fn compare(
     let mut sides = workload.sides(granted);
     let mut turns: BTreeMap<usize, Vec<Turn>> = BTreeMap::new();
     let mut random = options.seed.max(1);
+    let meter = PowerMeter::of_this_machine();
+    let mut memory = Vec::new();
     for _ in 0..options.turns {
         let mut order: Vec<usize> = (0..sides.len()).collect();
         // Fisher and Yates.
@@ -115,7 +123,8 @@ fn compare(
             order.swap(last, (random % (last as u64 + 1)) as usize);
         }
         for index in order {
-            match sides[index].turn(workload, &answers, [options.warm_up, options.turn]) {
+            let seconds = [options.warm_up, options.turn];
+            match sides[index].turn(workload, &answers, &meter, seconds) {
                 Ok(turn) => turns.entry(index).or_default().push(turn),
                 Err(why) => {
                     let note = format!("{}: skipped: {why}", sides[index].name());
@@ -128,6 +137,10 @@ fn compare(
     }
     let series = sides.iter_mut().enumerate().filter_map(|(index, side)| {
         let turns = turns.remove(&index)?;
+        let points = turns.last()?.memory.clone();
+        if !points.is_empty() {
+            memory.push(GrowthCurve { name: side.name(), points });
+        }
         let add = |count: fn(&Turn) -> u64| turns.iter().map(count).sum::<u64>();
         let reception =
             Reception { sent: add(|turn| turn.sent), answered: add(|turn| turn.answered) };
@@ -142,6 +155,12 @@ fn compare(
         ] {
             details.extend(value.map(|value| (name.to_owned(), value)));
         }
+        for (part, _) in &turns.last()?.power_w {
+            let of_part =
+                |turn: &Turn| turn.power_w.iter().find(|(name, _)| name == part).map(|it| it.1);
+            let watts: Vec<f64> = turns.iter().filter_map(of_part).collect();
+            details.insert(format!("power of {part}, W"), format!("{:.2}", quantile(&watts, 0.5)));
+        }
         let values = turns.iter().flat_map(|turn| turn.times_ms.iter().copied()).collect();
         Some(Series { name: side.name(), details, reception: Some(reception), values })
     });
@@ -151,6 +170,14 @@ fn compare(
     goals::of_group(workload, granted, &group, &mut results.figures);
     for side in &sides {
         side.stages(workload, &group.name, &mut results.figures);
+    }
+    if !memory.is_empty() {
+        results.growths.push(Growth {
+            name: format!("{}: memory (PSS) in the last turn", group.name),
+            of: "seconds".to_owned(),
+            unit: "MB".to_owned(),
+            curves: memory,
+        });
     }
     results.groups.push(group);
 }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
-use gleaner_bench_results::Figure;
+use gleaner_bench_results::{Figure, PowerMeter};
 use gleaner_protocol::LiveStatus;
 use gleaner_tests::live::{PATIENCE, RunningProgram, cpu_ns, descendants, play, run};
 use gleaner_tests::{LambdaCopy, TempFolder};
@@ -15,6 +15,10 @@ use super::node::NodeSide;
 use super::workload::Workload;
 use crate::answers::{RttAnswer, RttReceiver};
 use crate::measure::{Twin, pss_mib};
+
+/// Interval of reading the memory of a side. A process waits meanwhile, for less than 1 in 1,000
+/// samples of an IMU at 100 Hz.
+const MEMORY_INTERVAL: Duration = Duration::from_secs(4);
 
 /// A side.
 pub(super) enum Side {
@@ -43,6 +47,10 @@ pub(super) struct Turn {
     /// Costs of all processes of the side; `None` for a part of the bench itself.
     pub(super) cpu_percent: Option<f64>,
     pub(super) memory_mb: Option<f64>,
+    /// Memory over the measured time: seconds, and MB.
+    pub(super) memory: Vec<[f64; 2]>,
+    /// Power of the whole machine: what was measured, and W.
+    pub(super) power_w: Vec<(String, f64)>,
     /// Facts about the side.
     pub(super) facts: BTreeMap<String, String>,
 }
@@ -75,6 +83,7 @@ impl Side {
         &mut self,
         workload: Workload,
         answers: &RttReceiver,
+        meter: &PowerMeter,
         [warm_up, measured]: [u32; 2],
     ) -> Result<Turn, String> {
         let (running, mut facts) = self.start(workload)?;
@@ -86,10 +95,17 @@ impl Side {
         let mut received = first(answers, &self.name());
         sleep(Duration::from_secs(warm_up.into()));
         let (before, began) = (running.cpu_ns(), Instant::now());
-        sleep(Duration::from_secs_f64(0.9 * f64::from(measured)));
+        let mut memory: Vec<[f64; 2]> = Vec::new();
+        let measured = Duration::from_secs_f64(0.9 * f64::from(measured));
+        let power_w = meter.watch(measured, |elapsed| {
+            let due = MEMORY_INTERVAL * memory.len() as u32;
+            if elapsed >= due {
+                memory.extend(running.memory_mb().map(|mb| [due.as_secs_f64(), mb]));
+            }
+        });
         let cpu = running.cpu_ns().zip(before).map(|(after, before)| after.saturating_sub(before));
         let span = began.elapsed();
-        let memory_mb = running.memory_mb();
+        let memory_mb = memory.last().map(|[_, mb]| *mb);
         let played = player.finish();
         let sent = played.sent()[workload.event().0];
         // The last answers may still be on their way.
@@ -105,6 +121,8 @@ impl Side {
             answered: received.len() as u64,
             cpu_percent: cpu.map(|cpu| 100.0 * cpu as f64 / span.as_nanos() as f64),
             memory_mb,
+            memory,
+            power_w,
             facts,
         })
     }
