@@ -19,6 +19,7 @@ pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, F
     let name = arguments.first().and_then(|name| name.to_str()).unwrap_or_default();
     match (name, arguments) {
         ("fleet", [_, rest @ ..]) => fleet(checkout, rest),
+        ("parts", [_, rest @ ..]) => parts(checkout, rest),
         ("compare", [_, base, head, name, rest @ ..]) => {
             let [base_runs, head_runs] = revisions::measure(checkout, [base, head], name, rest)?;
             compare(checkout, &["compare".into(), base_runs.into(), head_runs.into()])
@@ -52,6 +53,13 @@ fn measure(checkout: &Checkout, name: &str, arguments: &[OsString]) -> Result<Ex
     build(checkout, "gleaner-bench")?;
     steps.begin("measurements");
     start(checkout, "gleaner-bench", arguments)
+}
+
+/// Measures single functions. Divan prints a table, and has options of its own.
+fn parts(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
+    let mut bench = checkout.cargo();
+    bench.args(["bench", "--package", "gleaner-bench-parts", "--"]).args(arguments);
+    steps::run(&mut bench, "see the first error above").map(|()| Exit::Ok)
 }
 
 /// Compares results that were stored.

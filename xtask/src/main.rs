@@ -39,7 +39,7 @@ const USAGE: &str = "usage: cargo xtask COMMAND
   bless    write the examples' decisions to expected.txt, and the generated files
   docs     fetch mdBook and build the pages as a book in target/book
   bench    run a benchmark: rtt, scale, isolation, cold-start, replay, record, drives, kernels,
-           inference or fleet; `compare A B` compares two results, and `compare BASE HEAD NAME`
+           inference, fleet or parts; `compare A B` compares two results, and `compare BASE HEAD NAME`
            measures two revisions in turns; see bench/README.md
   fleet    serve the cloud as three replicas on this machine, until ctrl-C; --install fetches its
            packages first, --kills N kills its programs in turn under simulated vehicles
