@@ -40,6 +40,12 @@ impl Checkout {
         Ok(Checkout { root, target, cargo })
     }
 
+    /// A checkout in `root`, with the program `cargo` in place of cargo.
+    #[cfg(test)]
+    pub(crate) fn with_cargo(root: PathBuf, cargo: OsString) -> Checkout {
+        Checkout { target: root.join("target"), root, cargo }
+    }
+
     /// Another checkout, in `root`, with a target folder of its own.
     pub(crate) fn other(&self, root: PathBuf) -> Checkout {
         Checkout { target: root.join("target"), root, cargo: self.cargo.clone() }

@@ -177,3 +177,110 @@ fn cannot_use(path: &Path, error: &std::io::Error) -> Failure {
     Failure::caused_by(Exit::Internal, format!("cannot use `{}`", path.display()), error)
         .with_help("the target folder has to be writable")
 }
+
+#[cfg(test)]
+mod tests {
+    use std::process::Command;
+
+    use super::*;
+    use crate::test_folder::TestFolder;
+
+    /// Takes the place of cargo: the results are the content of `value` in the checkout. Each call
+    /// is a line of `calls`, next to this file.
+    const CARGO: &str = r#"#!/bin/sh
+echo "$(cat value) $*" >> "$(dirname "$0")/calls"
+test "$(cat value)" != broken || exit 1
+while [ "$1" != --out ]; do shift; done
+mkdir -p "$2"
+cp value "$2/results.json"
+# As if a goal was not met.
+exit 1
+"#;
+
+    struct Repository(TestFolder);
+
+    impl Repository {
+        fn new() -> Self {
+            let repository = Self(TestFolder::new());
+            repository.0.write_program("bin/cargo", CARGO);
+            repository.0.write(".gitignore", "target\nbin\n");
+            repository.git(&["init", "--quiet"]);
+            for value in ["one", "two", "broken"] {
+                repository.0.write("value", value);
+                repository.git(&["add", "."]);
+                repository.git(&["commit", "--quiet", "-m", value]);
+                repository.git(&["tag", value]);
+            }
+            repository
+        }
+
+        fn git(&self, args: &[&str]) {
+            let mut git = Command::new("git");
+            git.current_dir(self.0.root()).args([
+                "-c",
+                "user.name=x",
+                "-c",
+                "user.email=x@localhost",
+            ]);
+            assert!(git.args(args).status().unwrap().success());
+        }
+
+        fn measure(&self, [base, head]: [&str; 2], rest: &[&str]) -> Result<[PathBuf; 2], Failure> {
+            let (root, cargo) = (self.0.root().to_owned(), self.0.path("bin/cargo"));
+            let checkout = Checkout::with_cargo(root, cargo.into());
+            let rest: Vec<OsString> = rest.iter().map(OsString::from).collect();
+            measure(&checkout, [base.as_ref(), head.as_ref()], "replay".as_ref(), &rest)
+        }
+
+        /// What cargo was started for: the revision, and its arguments up to the folder.
+        fn calls(&self) -> Vec<String> {
+            let calls = fs::read_to_string(self.0.path("bin/calls")).unwrap();
+            let call = |line: &str| line.split(" --out").next().unwrap().to_owned();
+            calls.lines().map(call).collect()
+        }
+    }
+
+    #[test]
+    fn two_revisions_are_measured_in_turns() {
+        let repository = Repository::new();
+        let args = ["--rounds", "3", "--long"];
+        for rounds in [&args[..], &["--rounds", "2"]] {
+            let runs = repository.measure(["one", "two"], rounds).unwrap();
+            for (runs, value) in runs.iter().zip(["one", "two"]) {
+                let mut numbers: Vec<_> =
+                    fs::read_dir(runs).unwrap().map(|run| run.unwrap().path()).collect();
+                numbers.sort();
+                // Those of an earlier comparison are gone.
+                assert_eq!(numbers.len().to_string(), rounds[1]);
+                for run in numbers {
+                    assert_eq!(fs::read_to_string(run.join("results.json")).unwrap(), value);
+                }
+            }
+            if rounds.len() == 3 {
+                let calls = repository.calls();
+                assert_eq!(
+                    calls[..2],
+                    ["one xtask bench replay --quick", "two xtask bench replay --quick"]
+                );
+                let order: Vec<&str> = calls[2..].iter().map(|call| &call[..3]).collect();
+                assert_eq!(order, ["one", "two", "two", "one", "one", "two"]);
+                assert!(calls[2].ends_with("xtask bench replay --long"), "{calls:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn what_cannot_be_compared_is_an_error_with_its_cause() {
+        let repository = Repository::new();
+        let failed =
+            |names, rest: &[&str]| repository.measure(names, rest).unwrap_err().to_string();
+        assert!(failed(["one", "HEAD~2"], &[]).contains("one revision"));
+        assert!(failed(["one", "never"], &[]).contains("`never` is no revision"));
+        assert!(failed(["one", "--help"], &[]).contains("`--help` is no revision"));
+        assert!(failed(["one", "two"], &["--rounds", "0"]).contains("from 1 to 1000"));
+        assert!(failed(["one", "broken"], &[]).contains("`broken` has no results of replay"));
+        let lock = File::create(repository.0.path("target/revisions/lock")).unwrap();
+        lock.lock().unwrap();
+        assert!(failed(["one", "two"], &[]).contains("another comparison"));
+    }
+}
