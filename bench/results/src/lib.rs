@@ -5,6 +5,7 @@
 //!   and as a page with plots.
 //! - [`Summary`] has the statistics of a series, and [`MeasuredDifference`] compares two.
 //! - [`Comparison`] compares two runs.
+//! - [`IsolationCosts`] become a recommendation.
 //! - [`Machine`] is where a run took place.
 
 mod comparison;
@@ -13,6 +14,7 @@ mod growth;
 mod machine;
 mod markdown;
 mod page;
+mod recommendation;
 mod results;
 mod statistics;
 #[cfg(test)]
@@ -23,5 +25,6 @@ pub use comparison::Comparison;
 pub use figure::{Figure, Goal};
 pub use growth::{Growth, GrowthCurve};
 pub use machine::Machine;
+pub use recommendation::{AttackCounts, IsolationCosts, KindValues, WakeCosts};
 pub use results::{BenchResults, Reception, Series, SeriesGroup};
 pub use statistics::{MeasuredDifference, Summary, quantile};

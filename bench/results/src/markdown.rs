@@ -47,6 +47,12 @@ impl BenchResults {
         for note in &self.notes {
             let _ = writeln!(text, "- {note}");
         }
+        if !self.recommendation.is_empty() {
+            text.push_str("\n## Recommendation\n\n");
+        }
+        for sentence in &self.recommendation {
+            let _ = writeln!(text, "- {sentence}");
+        }
         text
     }
 

@@ -38,6 +38,7 @@ impl BenchResults {
                 .join(" · "),
             facts: facts.map(|(name, value)| (name.clone(), value.clone())).collect(),
             notes: self.notes.clone(),
+            recommendation: self.recommendation.clone(),
             sections: groups.chain(growths).chain(figures).collect(),
         }
         .to_html()

@@ -21,9 +21,10 @@ use gleaner_dds::{Dds, DdsOptions};
 
 use crate::answers::RttReceiver;
 use crate::live::BusyCores;
+use crate::measure::shuffled;
 use buffers::BufferLimit;
 use sides::{Side, Turn};
-use workload::Workload;
+pub(crate) use workload::Workload;
 
 /// Topic of all answers.
 const ANSWERS: &str = "/rtt/answers";
@@ -106,15 +107,7 @@ fn compare(
     let mut turns: BTreeMap<usize, Vec<Turn>> = BTreeMap::new();
     let mut random = options.seed.max(1);
     for _ in 0..options.turns {
-        let mut order: Vec<usize> = (0..sides.len()).collect();
-        // Fisher and Yates.
-        for last in (1..order.len()).rev() {
-            random ^= random << 13;
-            random ^= random >> 7;
-            random ^= random << 17;
-            order.swap(last, (random % (last as u64 + 1)) as usize);
-        }
-        for index in order {
+        for index in shuffled(sides.len(), &mut random) {
             match sides[index].turn(workload, &answers, [options.warm_up, options.turn]) {
                 Ok(turn) => turns.entry(index).or_default().push(turn),
                 Err(why) => {

@@ -1,0 +1,150 @@
+//! Cost of a host call, of a column, and of the ways to the pixels of a frame, in CPU time.
+//!
+//! Native calls are those of the functions behind the host calls, without a guest.
+
+use std::collections::BTreeMap;
+use std::hint::black_box;
+
+use gleaner_bench_results::{
+    BenchResults, Figure, IsolationCosts, KindValues, Series, SeriesGroup, quantile,
+};
+use gleaner_tests::{TempFolder, replay, root};
+
+use super::drives::{self, FRAME_BYTES};
+use super::hosted::{COLUMN, FilledInputs, HostedKernel};
+use crate::measure::timed;
+
+/// Name of the row of a copy without Gleaner.
+const MEMCPY: &str = "memcpy";
+
+/// Measured times by the name of their row.
+type Times = BTreeMap<&'static str, Vec<f64>>;
+
+pub(super) fn measure(quick: bool, results: &mut BenchResults, costs: &mut IsolationCosts) {
+    eprintln!("host calls, columns and frames");
+    let rounds = if quick { 1 } else { 31 };
+    let wasm = in_wasm(rounds);
+    let native = natively(rounds);
+    let python = in_python(quick);
+    let median = |times: &Times, name| times.get(name).map(|times| quantile(times, 0.5));
+    costs.host_call_ns = KindValues {
+        native: median(&native, "call"),
+        wasm: median(&wasm, "call"),
+        python: median(&python, "call"),
+    };
+    let of_kinds =
+        |name| [("native", &native, name), ("wasm", &wasm, name), ("Python", &python, name)];
+    results.groups.push(group("A host call, `now-ns`", ("ns", 1.0), "native", &of_kinds("call")));
+    let name = "A field of 256 samples, as a column";
+    results.groups.push(group(name, ("us", 1e3), "native", &of_kinds("column")));
+    let frame = [
+        (MEMCPY, &native, "memcpy"),
+        ("native: mean luma by the host", &native, "luma-by-host"),
+        ("wasm: mean luma by the host", &wasm, "luma-by-host"),
+        ("Python: mean luma by the host", &python, "luma-by-host"),
+        ("wasm: read in pieces of 64 KiB", &wasm, "stream"),
+        ("wasm: pieces copied into a whole frame", &wasm, "copy"),
+        ("wasm: copied, then mean luma in the lambda", &wasm, "copy-luma"),
+        ("Python: view as an array", &python, "array"),
+        ("Python: copy of that array", &python, "copy"),
+        ("Python: mean of that array by numpy", &python, "mean"),
+    ];
+    let name = "A frame of 1080p bgr8 (6.2 MB)";
+    results.groups.push(group(name, ("us", 1e3), MEMCPY, &frame));
+    let ratios = wasm["stream"].iter().zip(&native["memcpy"]).map(|(read, copied)| read / copied);
+    results.figures.push(Figure::at_most(
+        "1920x1080 bgr8 read in pieces by a component, against memcpy",
+        "times",
+        1.1,
+        &ratios.collect::<Vec<_>>(),
+    ));
+    let name = "slot to ndarray, 1920x1080 bgr8 (6.2 MB)";
+    results.figures.push(Figure::at_most(name, "ns", 1000.0, &python["array"]));
+    let name = "wake of an empty component, in a loop";
+    results.figures.push(Figure::without_goal(name, "ns", &wasm["empty"]));
+}
+
+/// Makes a group of rows, each with its name and the times in ns by a name.
+fn group(
+    name: &str,
+    (unit, ns): (&str, f64),
+    base: &str,
+    rows: &[(&str, &Times, &str)],
+) -> SeriesGroup {
+    let series = rows.iter().filter_map(|(row, times, name)| {
+        let values = times.get(name)?.iter().map(|time| time / ns).collect();
+        Some(Series { name: (*row).to_owned(), values, ..Series::default() })
+    });
+    SeriesGroup {
+        name: name.to_owned(),
+        unit: unit.to_owned(),
+        base: Some(base.to_owned()),
+        series: series.collect(),
+    }
+}
+
+fn in_wasm(rounds: usize) -> Times {
+    let work = [("call", 100_000), ("column", 200), ("stream", 4), ("copy", 4)];
+    let work = work.into_iter().chain([("copy-luma", 4), ("luma-by-host", 4)]);
+    let mut kernels: Vec<_> =
+        work.map(|(work, repeated)| (work, HostedKernel::new(work, repeated))).collect();
+    let mut empty = HostedKernel::new("copy", 0);
+    let mut times = Times::new();
+    for _ in 0..rounds {
+        for (work, kernel) in &mut kernels {
+            let us = timed(kernel.rounds(), || kernel.frame()).0;
+            times.entry(work).or_default().push(1e3 * us);
+        }
+        let us = timed(2000, || (0..2000).for_each(|_| empty.tick())).0;
+        times.entry("empty").or_default().push(1e3 * us);
+    }
+    times
+}
+
+fn natively(rounds: usize) -> Times {
+    let inputs = FilledInputs::new(Vec::new());
+    let field = inputs.imu.field("linear_acceleration.x").expect("a field of an IMU");
+    let sample = inputs.camera.newest().expect("no holds are refused").expect("a frame");
+    let frame = sample.as_frame().expect("an image");
+    let source = vec![7_u8; FRAME_BYTES];
+    let mut target = vec![0_u8; FRAME_BYTES];
+    let mut call = || {
+        black_box(inputs.session.now_ns());
+    };
+    let mut column = || drop(black_box(inputs.imu.column(&field, COLUMN)).expect("a column"));
+    let mut luma = || drop(black_box(frame.mean_luma(None)));
+    let mut memcpy = || black_box(&mut target).copy_from_slice(black_box(&source));
+    let mut work: [(&str, u64, &mut dyn FnMut()); 4] = [
+        ("call", 100_000, &mut call),
+        ("column", 200, &mut column),
+        ("luma-by-host", 4, &mut luma),
+        ("memcpy", 4, &mut memcpy),
+    ];
+    let mut times = Times::new();
+    for _ in 0..rounds {
+        for (name, repeated, work) in &mut work {
+            let us = timed(*repeated, || (0..*repeated).for_each(|_| work())).0;
+            times.entry(name).or_default().push(1e3 * us);
+        }
+    }
+    times
+}
+
+/// Replays the lambda that measures itself: a value of each row for each frame.
+fn in_python(quick: bool) -> Times {
+    let folder = TempFolder::new();
+    let frames = if quick { 1 } else { 31 };
+    let topics = ["/imu/data", "/camera/front/image_raw"];
+    let drive = drives::with_frames(&folder, topics, COLUMN, frames);
+    let run = replay(&root().join("bench/lambdas/access/python"), &[drive], &["--no-record"]);
+    let mut times = Times::new();
+    for trigger in run.must_exit(0).decisions.iter().flat_map(|decision| &decision.triggers) {
+        let known = ["call", "column", "luma-by-host", "array", "copy", "mean"];
+        let name = known.into_iter().find(|name| *name == trigger.label);
+        let time = name.zip(trigger.score);
+        let (name, ns) = time.expect("the lambda measures these");
+        times.entry(name).or_default().push(ns);
+    }
+    assert_eq!(run.first_fault(), None);
+    times
+}
