@@ -5,14 +5,20 @@ use crate::statistics::MeasuredDifference;
 
 /// Least ratio that counts as a difference between the kinds: less depends on the machine.
 const FACTOR: f64 = 1.25;
+/// Least differences that a user could notice, in the units of the costs.
+const LEAST_US: f64 = 1.0;
+const LEAST_MB: f64 = 1.0;
+const LEAST_START_MS: f64 = 10.0;
+const LEAST_RESTARTED_MS: f64 = 1.0;
+const LEAST_KILLED_S: f64 = 0.1;
 
 /// Costs of isolation. What was not measured is `None`, and is left out of the recommendation.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct IsolationCosts {
     /// Wakes of the same lambdas.
     pub wakes: Vec<WakeCosts>,
-    /// CPU time of the lambda's process per wake in a live run, in us.
-    pub live_cpu_us: KindValues,
+    /// CPU time of the lambda's process per wake of live runs, in us, with their names.
+    pub live_cpu_us: Vec<(String, KindValues)>,
     /// A host call, in ns.
     pub host_call_ns: KindValues,
     /// Memory of the processes of one lambda, in MB.
@@ -23,7 +29,7 @@ pub struct IsolationCosts {
     pub start_ms: KindValues,
     /// The wake after a trap or an exception, in ms.
     pub restarted_ms: KindValues,
-    /// Time until a lambda answers again after its process was killed, in s.
+    /// Time until a lambda is ready again after its process was killed, in s.
     pub killed_s: KindValues,
     /// Attacks on other lambdas.
     pub attacks: Option<AttackCounts>,
@@ -60,27 +66,39 @@ pub struct AttackCounts {
     pub unseen: usize,
 }
 
+/// The kind that costs less.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum CheaperKind {
+    Wasm,
+    Python,
+}
+
 /// A cost that decides between the kinds.
 struct Criterion<'a> {
     name: &'a str,
     wasm: f64,
     python: f64,
+    /// The least difference that a user could notice.
+    least: f64,
 }
 
 impl IsolationCosts {
     /// Returns the sentences of the recommendation, the rules of when to take which kind last.
     pub fn recommendation(&self) -> Vec<String> {
         let mut sentences: Vec<String> = self.wakes.iter().flat_map(WakeCosts::sentences).collect();
-        let said = [
+        sentences.extend(self.live_cpu_us.iter().filter_map(|(name, values)| {
+            values.sentence(&format!("{name}, a wake takes of the CPU"), "us")
+        }));
+        let costs = [
             ("A host call takes", self.host_call_ns, "ns"),
-            ("In a live run a wake takes, of the CPU,", self.live_cpu_us, "us"),
             ("The processes of one lambda take", self.first_lambda_mb, "MB"),
             ("Each further lambda of the same kind takes", self.further_lambda_mb, "MB"),
             ("A process that starts, wakes once and ends takes", self.start_ms, "ms"),
             ("After a trap or an exception, the next wake takes", self.restarted_ms, "ms"),
-            ("After its process was killed, a lambda answers again after", self.killed_s, "s"),
+            ("After its process was killed, a lambda is ready again after", self.killed_s, "s"),
         ];
-        sentences.extend(said.iter().filter_map(|(what, values, unit)| values.told(what, unit)));
+        sentences
+            .extend(costs.iter().filter_map(|(what, values, unit)| values.sentence(what, unit)));
         sentences.extend(self.attacks.map(AttackCounts::sentence));
         sentences.extend(self.rules());
         sentences
@@ -88,28 +106,27 @@ impl IsolationCosts {
 
     /// Returns when to take which kind.
     fn rules(&self) -> Vec<String> {
-        let wakes = self.wakes.iter().map(|wake| (wake.name.as_str(), wake.us));
+        let wakes = self.wakes.iter().map(|wake| (wake.name.as_str(), wake.us, LEAST_US));
+        let live = self.live_cpu_us.iter().map(|(name, us)| (name.as_str(), *us, LEAST_US));
         let others = [
-            ("CPU of a live run", self.live_cpu_us),
-            ("memory", self.further_lambda_mb),
-            ("starts", self.start_ms),
-            ("recovery from a fault", self.restarted_ms),
-            ("recovery from a kill", self.killed_s),
+            ("memory", self.further_lambda_mb, LEAST_MB),
+            ("starts", self.start_ms, LEAST_START_MS),
+            ("recovery from a fault", self.restarted_ms, LEAST_RESTARTED_MS),
+            ("recovery from a kill", self.killed_s, LEAST_KILLED_S),
         ];
-        let criteria: Vec<Criterion<'_>> = wakes
-            .chain(others)
-            .filter_map(|(name, values)| {
+        let all = wakes.chain(live).chain(others);
+        let criteria: Vec<Criterion<'_>> = all
+            .filter_map(|(name, values, least)| {
                 let (wasm, python) = values.wasm.zip(values.python)?;
-                Some(Criterion { name, wasm, python })
+                Some(Criterion { name, wasm, python, least })
             })
             .collect();
-        let of = |is_one: fn(&Criterion<'_>) -> bool| {
-            let names = criteria.iter().filter(|it| is_one(it)).map(|it| it.name);
+        let of = |better: Option<CheaperKind>| {
+            let names = criteria.iter().filter(|it| it.better() == better).map(|it| it.name);
             names.collect::<Vec<_>>()
         };
-        let wasm = of(|it| it.python >= FACTOR * it.wasm);
-        let python = of(|it| it.wasm >= FACTOR * it.python);
-        let equal = of(|it| it.python < FACTOR * it.wasm && it.wasm < FACTOR * it.python);
+        let [wasm, python, equal] =
+            [Some(CheaperKind::Wasm), Some(CheaperKind::Python), None].map(of);
         let mut rules = Vec::new();
         if !wasm.is_empty() {
             rules.push(format!("So take wasm where these matter: {}.", listed(&wasm)));
@@ -118,10 +135,8 @@ impl IsolationCosts {
             rules.push(format!("So take Python where these matter: {}.", listed(&python)));
         }
         if !equal.is_empty() {
-            rules.push(format!(
-                "The kind makes no difference (less than {FACTOR} times) for: {}.",
-                listed(&equal)
-            ));
+            rules
+                .push(format!("The kind makes no difference that counts for: {}.", listed(&equal)));
         }
         match (wasm.is_empty(), python.is_empty()) {
             (false, true) => rules.push(
@@ -140,10 +155,23 @@ impl IsolationCosts {
     }
 }
 
+impl Criterion<'_> {
+    /// Returns the kind that costs less; `None` if a user would not notice the difference.
+    fn better(&self) -> Option<CheaperKind> {
+        let (low, high) = (self.wasm.min(self.python), self.wasm.max(self.python));
+        let is_seen = high >= FACTOR * low && high - low >= self.least;
+        is_seen.then_some(if self.wasm < self.python {
+            CheaperKind::Wasm
+        } else {
+            CheaperKind::Python
+        })
+    }
+}
+
 impl WakeCosts {
     fn sentences(&self) -> Vec<String> {
         let name = &self.name;
-        let told = match self.us.native {
+        let times = match self.us.native {
             Some(native) => self.us.wasm.zip(self.us.python).map(|(wasm, python)| {
                 format!(
                     "{name}: {} us as a native function, {} us in wasm ({} times) and {} us in \
@@ -155,10 +183,10 @@ impl WakeCosts {
                     number(python / native)
                 )
             }),
-            None => self.us.told(&format!("{name}:"), "us"),
+            None => self.us.sentence(&format!("{name}:"), "us"),
         };
         let cost = self.us.wasm.zip(self.us.python).and_then(|(wasm, python)| {
-            let (dear, more_us) = match python > wasm {
+            let (slower, more_us) = match python > wasm {
                 true => ("Python", python - wasm),
                 false => ("wasm", wasm - python),
             };
@@ -167,7 +195,7 @@ impl WakeCosts {
             let is_different = wasm.max(python) >= FACTOR * wasm.min(python);
             is_different.then(|| {
                 format!(
-                    "The {} us more in {dear} are 1 % of a core at {} such wakes in a second.",
+                    "The {} us more in {slower} are 1 % of a core at {} such wakes in a second.",
                     number(more_us),
                     number(rate_hz)
                 )
@@ -180,14 +208,14 @@ impl WakeCosts {
             ),
             false => "A cost of fuel and epochs was not seen in it.".to_owned(),
         });
-        let text: Vec<String> = [told, cost, checks].into_iter().flatten().collect();
+        let text: Vec<String> = [times, cost, checks].into_iter().flatten().collect();
         if text.is_empty() { Vec::new() } else { vec![text.join(" ")] }
     }
 }
 
 impl KindValues {
     /// Returns a sentence about both kinds, if both were measured.
-    fn told(&self, what: &str, unit: &str) -> Option<String> {
+    fn sentence(&self, what: &str, unit: &str) -> Option<String> {
         let (wasm, python) = self.wasm.zip(self.python)?;
         let native = self
             .native
@@ -280,8 +308,16 @@ mod tests {
         let said = text(&costs);
         assert!(said.contains("Each further lambda of the same kind takes 2.00 MB in wasm and 15"));
         assert!(said.contains("So take wasm where these matter: IMU; memory."), "{said}");
-        assert!(said.contains("less than 1.25 times) for: recovery from a kill."), "{said}");
+        assert!(said.contains("makes no difference that counts for: recovery from a kill."));
         assert!(said.contains("Nothing that was measured favours Python"), "{said}");
+
+        // Three times as long, and less than a millisecond.
+        costs.restarted_ms = both(0.3, 0.1);
+        costs.live_cpu_us.push(("IMU, live".to_owned(), both(80.0, 200.0)));
+        let said = text(&costs);
+        assert!(said.contains("IMU, live, a wake takes of the CPU 80.00 us in wasm and 200 us in"));
+        assert!(said.contains("take wasm where these matter: IMU; IMU, live; memory."), "{said}");
+        assert!(said.contains("for: recovery from a fault; recovery from a kill."), "{said}");
 
         costs.start_ms = both(100.0, 50.0);
         let said = text(&costs);

@@ -12,19 +12,27 @@ use gleaner_tests::{TempFolder, replay, root};
 
 use super::drives::{self, FRAME_BYTES};
 use super::hosted::{COLUMN, FilledInputs, HostedKernel};
-use crate::measure::timed;
+use crate::measure::{shuffled, timed};
 
 /// Name of the row of a copy without Gleaner.
 const MEMCPY: &str = "memcpy";
 
+/// Places of the measured times.
+const NATIVE: usize = 0;
+const WASM: usize = 1;
+
 /// Measured times by the name of their row.
 type Times = BTreeMap<&'static str, Vec<f64>>;
 
-pub(super) fn measure(quick: bool, results: &mut BenchResults, costs: &mut IsolationCosts) {
+pub(super) fn measure(
+    quick: bool,
+    seed: u64,
+    results: &mut BenchResults,
+    costs: &mut IsolationCosts,
+) {
     eprintln!("host calls, columns and frames");
     let rounds = if quick { 1 } else { 31 };
-    let wasm = in_wasm(rounds);
-    let native = natively(rounds);
+    let [native, wasm] = in_this_process(rounds, &mut seed.max(1));
     let python = in_python(quick);
     let median = |times: &Times, name| times.get(name).map(|times| quantile(times, 0.5));
     costs.host_call_ns = KindValues {
@@ -83,48 +91,46 @@ fn group(
     }
 }
 
-fn in_wasm(rounds: usize) -> Times {
-    let work = [("call", 100_000), ("column", 200), ("stream", 4), ("copy", 4)];
-    let work = work.into_iter().chain([("copy-luma", 4), ("luma-by-host", 4)]);
-    let mut kernels: Vec<_> =
-        work.map(|(work, repeated)| (work, HostedKernel::new(work, repeated))).collect();
-    let mut empty = HostedKernel::new("copy", 0);
-    let mut times = Times::new();
-    for _ in 0..rounds {
-        for (work, kernel) in &mut kernels {
-            let us = timed(kernel.rounds(), || kernel.frame()).0;
-            times.entry(work).or_default().push(1e3 * us);
-        }
-        let us = timed(2000, || (0..2000).for_each(|_| empty.tick())).0;
-        times.entry("empty").or_default().push(1e3 * us);
-    }
-    times
-}
-
-fn natively(rounds: usize) -> Times {
+/// Measures calls of a component and native ones, in an order by `random` in each round.
+fn in_this_process(rounds: usize, random: &mut u64) -> [Times; 2] {
     let inputs = FilledInputs::new(Vec::new());
     let field = inputs.imu.field("linear_acceleration.x").expect("a field of an IMU");
     let sample = inputs.camera.newest().expect("no holds are refused").expect("a frame");
     let frame = sample.as_frame().expect("an image");
     let source = vec![7_u8; FRAME_BYTES];
     let mut target = vec![0_u8; FRAME_BYTES];
-    let mut call = || {
-        black_box(inputs.session.now_ns());
-    };
-    let mut column = || drop(black_box(inputs.imu.column(&field, COLUMN)).expect("a column"));
-    let mut luma = || drop(black_box(frame.mean_luma(None)));
-    let mut memcpy = || black_box(&mut target).copy_from_slice(black_box(&source));
-    let mut work: [(&str, u64, &mut dyn FnMut()); 4] = [
-        ("call", 100_000, &mut call),
-        ("column", 200, &mut column),
-        ("luma-by-host", 4, &mut luma),
-        ("memcpy", 4, &mut memcpy),
+    let mut works: Vec<(usize, &str, u64, Box<dyn FnMut() + '_>)> = vec![
+        (NATIVE, "call", 100_000, Box::new(|| drop(black_box(Some(inputs.session.now_ns()))))),
+        (
+            NATIVE,
+            "column",
+            200,
+            Box::new(|| drop(black_box(inputs.imu.column(&field, COLUMN)).expect("a column"))),
+        ),
+        (NATIVE, "luma-by-host", 4, Box::new(|| drop(black_box(frame.mean_luma(None))))),
+        (
+            NATIVE,
+            "memcpy",
+            4,
+            Box::new(|| black_box(&mut target).copy_from_slice(black_box(&source))),
+        ),
     ];
-    let mut times = Times::new();
+    let hosted = [("call", 100_000), ("column", 200), ("stream", 4), ("copy", 4), ("copy-luma", 4)];
+    for (work, repeated) in hosted.into_iter().chain([("luma-by-host", 4)]) {
+        let mut kernel = HostedKernel::new(work, repeated);
+        works.push((WASM, work, repeated, Box::new(move || kernel.frame())));
+    }
+    let mut empty = HostedKernel::new("copy", 0);
+    works.push((WASM, "empty", 2000, Box::new(move || empty.tick())));
+    // A frame makes a component repeat its work by itself.
+    let is_repeated_here = |at: usize, work: &str| at == NATIVE || work == "empty";
+    let mut times = [Times::new(), Times::new()];
     for _ in 0..rounds {
-        for (name, repeated, work) in &mut work {
-            let us = timed(*repeated, || (0..*repeated).for_each(|_| work())).0;
-            times.entry(name).or_default().push(1e3 * us);
+        for index in shuffled(works.len(), random) {
+            let (at, name, repeated, work) = &mut works[index];
+            let calls = if is_repeated_here(*at, name) { *repeated } else { 1 };
+            let us = timed(*repeated, || (0..calls).for_each(|_| work())).0;
+            times[*at].entry(name).or_default().push(1e3 * us);
         }
     }
     times

@@ -5,6 +5,10 @@ use std::path::PathBuf;
 use gleaner_tests::TempFolder;
 use gleaner_tests::drive::{IMAGE, TopicMessages, image, of_topics};
 
+/// Topics of the lambdas that are compared.
+pub(super) const IMU: &str = "/imu/synthetic";
+pub(super) const CAMERA: &str = "/camera/synthetic/image_raw";
+
 /// Bytes of the pixels of a frame.
 pub(super) const FRAME_BYTES: usize = 1920 * 1080 * 3;
 

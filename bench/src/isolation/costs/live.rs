@@ -2,30 +2,32 @@
 //! memory, and the time until a killed process is replaced.
 
 use std::path::Path;
-use std::thread::sleep;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use gleaner_bench_results::{
     BenchResults, Growth, GrowthCurve, IsolationCosts, KindValues, Series, SeriesGroup, quantile,
 };
-use gleaner_lambda::Decision;
 use gleaner_protocol::Report;
-use gleaner_tests::live::{PATIENCE, RunningProgram, run_all};
+use gleaner_tests::live::{RunningProgram, run_all};
 use gleaner_tests::{LambdaCopy, TempFolder, sample_drive};
-use gleaner_transport::Clock;
 use rustix::process::{Pid, Signal, kill_process};
 
+use super::drives::{self, CAMERA, IMU};
 use crate::live::LiveProcesses;
 use crate::measure::{Twin, pss_mib};
+use crate::rtt::Workload;
 
 const KINDS: [Twin; 2] = [Twin::Rust, Twin::Python];
-/// Wakes of each lambda before its memory is read: some have computed a spectrum.
+/// Wakes by the IMU before anything is read: some have computed a spectrum.
 const WARM_UP: u64 = 160;
+/// The same for frames.
+const WARM_UP_FRAMES: u64 = 5;
 
 /// Measurements of one kind.
 #[derive(Default)]
 struct LiveKind {
-    cpu_us: Vec<f64>,
+    imu_cpu_us: Vec<f64>,
+    camera_cpu_us: Vec<f64>,
     killed_s: Vec<f64>,
     /// Number of lambdas, and memory of all of them in MB.
     memory: Vec<(usize, f64)>,
@@ -36,28 +38,37 @@ pub(super) fn measure(quick: bool, results: &mut BenchResults, costs: &mut Isola
     let (rounds, counts, statuses): (_, &[usize], _) =
         if quick { (1, &[1], 2) } else { (5, &[1, 2, 4], 5) };
     let mut kinds = [LiveKind::default(), LiveKind::default()];
+    let folder = TempFolder::new();
+    // Enough for three statuses, one in a second.
+    let frames = (!quick).then(|| drives::with_frames(&folder, [IMU, CAMERA], 60, 40));
     for _ in 0..rounds {
-        for count in counts {
-            for (kind, live) in KINDS.into_iter().zip(&mut kinds) {
-                live.run(kind, *count, statuses);
+        for (kind, live) in KINDS.into_iter().zip(&mut kinds) {
+            counts.iter().for_each(|count| live.run_imu(kind, *count, statuses));
+            if let Some(frames) = &frames {
+                live.run_camera(kind, frames);
             }
         }
     }
+    for (name, of) in [
+        ("IMU, FFT, live at 100 Hz", (|live| &live.imu_cpu_us) as fn(&LiveKind) -> &Vec<f64>),
+        ("1080p, Brake + Dark, live at 10 Hz", |live| &live.camera_cpu_us),
+    ] {
+        if kinds.iter().all(|live| !of(live).is_empty()) {
+            let title = format!("{name}: CPU of the lambda's process per wake");
+            results.groups.push(group(&title, "us", &kinds, of));
+            let medians = values(&kinds, |live| Some(quantile(of(live), 0.5)));
+            costs.live_cpu_us.push((name.to_owned(), medians));
+        }
+    }
     results.groups.push(group(
-        "IMU, FFT, live at 100 Hz: CPU of the lambda's process per wake",
-        "us",
-        &kinds,
-        |live| &live.cpu_us,
-    ));
-    results.groups.push(group(
-        "A killed process: time until the lambda answers again",
+        "A killed process: time until the lambda is ready again",
         "s",
         &kinds,
         |live| &live.killed_s,
     ));
     results.notes.push(
-        "*A killed process* is replaced after a pause of 1 s, which doubles with each kill within \
-         a minute; the daemon on a vehicle pauses for 0.1 s if another program kills it."
+        "*A killed process* is replaced after a pause of 1 s, which doubles with each further kill \
+         within a minute; the daemon on a vehicle pauses for 0.1 s if another program killed it."
             .to_owned(),
     );
     let curve = |(kind, live): (Twin, &LiveKind)| GrowthCurve {
@@ -76,7 +87,6 @@ pub(super) fn measure(quick: bool, results: &mut BenchResults, costs: &mut Isola
         let grown = live.memory_of(*last) - live.memory_of(*first);
         Some(grown / (last - first) as f64)
     });
-    costs.live_cpu_us = values(&kinds, |live| Some(quantile(&live.cpu_us, 0.5)));
     costs.killed_s = values(&kinds, |live| Some(quantile(&live.killed_s, 0.5)));
 }
 
@@ -105,18 +115,17 @@ fn group(
 }
 
 impl LiveKind {
-    /// Runs `count` lambdas. A single one is also measured by its CPU time, and killed.
-    fn run(&mut self, kind: Twin, count: usize, statuses: usize) {
+    /// Runs `count` lambdas on the IMU of the sample drive. A single one is also measured by its
+    /// CPU time, and killed.
+    fn run_imu(&mut self, kind: Twin, count: usize, statuses: usize) {
         let folder = format!("examples/imu-fft/{}", kind.folder());
         let copies: Vec<_> = (0..count)
             .map(|index| LambdaCopy::named(&folder, &format!("imu-fft-{index}")))
             .collect();
-        let folders: Vec<&Path> = copies.iter().map(LambdaCopy::path).collect();
-        let (out, drive) = (TempFolder::new(), sample_drive());
-        let drive = drive.to_str().expect("a plain name");
-        let started = run_all(&folders, out.path(), &["--no-record", "--all", "--drive", drive]);
+        let out = TempFolder::new();
+        let started = run_on(&sample_drive(), &copies, &out);
         if count == 1 {
-            self.cpu_per_wake(&started, statuses);
+            self.imu_cpu_us.extend(cpu_per_wake(&started, WARM_UP, statuses));
         } else {
             until_all_warm(&started, count);
         }
@@ -125,27 +134,46 @@ impl LiveKind {
         let megabytes = memory.sum::<f64>() * f64::from(1 << 20) / 1e6;
         self.memory.push((count, megabytes));
         if let ([lambda], 1) = (&processes.lambdas[..], count) {
-            self.killed_s.push(until_replaced(*lambda, out.path()));
+            self.killed_s.push(until_replaced(*lambda, &started));
         }
         started.signal("INT");
         started.finish();
     }
 
-    /// Adds the CPU time per wake between statuses.
-    fn cpu_per_wake(&mut self, started: &RunningProgram, statuses: usize) {
-        let mut before = started.until_live("the first spectra", |live| live.wakes >= WARM_UP);
-        for _ in 1..statuses {
-            let live = started.until_live("a status", |_| true);
-            let wakes = (live.wakes - before.wakes) as f64;
-            self.cpu_us.push(1e6 * (live.cpu_s - before.cpu_s) / wakes);
-            before = live;
-        }
+    fn run_camera(&mut self, kind: Twin, drive: &Path) {
+        let out = TempFolder::new();
+        let started = run_on(drive, &[Workload::Brake1080.lambda(kind)], &out);
+        self.camera_cpu_us.extend(cpu_per_wake(&started, WARM_UP_FRAMES, 3));
+        started.signal("INT");
+        started.finish();
     }
 
     fn memory_of(&self, count: usize) -> f64 {
         let of_count = self.memory.iter().filter(|(lambdas, _)| *lambdas == count);
         quantile(&of_count.map(|(_, megabytes)| *megabytes).collect::<Vec<_>>(), 0.5)
     }
+}
+
+fn run_on(drive: &Path, lambdas: &[LambdaCopy], out: &TempFolder) -> RunningProgram {
+    let folders: Vec<&Path> = lambdas.iter().map(LambdaCopy::path).collect();
+    let drive = drive.to_str().expect("a plain name");
+    let started = run_all(&folders, out.path(), &["--no-record", "--drive", drive]);
+    if lambdas.len() == 1 {
+        started.until_ready();
+    }
+    started
+}
+
+/// Returns the CPU time of a lambda's process per wake in us, between each two of its statuses.
+fn cpu_per_wake(started: &RunningProgram, warm_up: u64, statuses: usize) -> Vec<f64> {
+    let mut before = started.until_live("the first wakes", |live| live.wakes >= warm_up);
+    let between = |_| {
+        let live = started.until_live("a status", |_| true);
+        let us = 1e6 * (live.cpu_s - before.cpu_s) / (live.wakes - before.wakes) as f64;
+        before = live;
+        us
+    };
+    (1..statuses).map(between).collect()
 }
 
 fn until_all_warm(started: &RunningProgram, count: usize) {
@@ -161,28 +189,12 @@ fn until_all_warm(started: &RunningProgram, count: usize) {
     });
 }
 
-/// Kills a lambda's process; returns the time until the end of its next wake, in s.
-fn until_replaced(lambda: u32, out: &Path) -> f64 {
-    let clock = Clock::from_time_of_day();
+/// Kills a lambda's process; returns the time until the `init` of the next one has returned, in s.
+/// That one answers the samples of the meantime first.
+fn until_replaced(lambda: u32, started: &RunningProgram) -> f64 {
     let pid = i32::try_from(lambda).ok().and_then(Pid::from_raw).expect("a process id");
-    let killed_ns = clock.now();
+    let killed = Instant::now();
     kill_process(pid, Signal::KILL).expect("the process runs");
-    let deadline = Instant::now() + PATIENCE;
-    loop {
-        let text = std::fs::read_to_string(out.join("decisions.jsonl")).unwrap_or_default();
-        // The last line may be incomplete.
-        let whole = text.rfind('\n').map_or("", |end| &text[..end]);
-        let newest: Option<Decision> =
-            whole.lines().next_back().and_then(|line| serde_json::from_str(line).ok());
-        // The process may have been within a wake.
-        if newest.is_some_and(|newest| newest.at_ns > killed_ns + 100_000_000) {
-            let decisions =
-                whole.lines().filter_map(|line| serde_json::from_str::<Decision>(line).ok());
-            let mut after = decisions.filter(|decision| decision.at_ns > killed_ns);
-            let first = after.next().expect("there is a newer one");
-            return (first.at_ns - killed_ns) as f64 / 1e9 + first.run_ns as f64 / 1e9;
-        }
-        assert!(Instant::now() < deadline, "a killed lambda is not replaced");
-        sleep(Duration::from_millis(20));
-    }
+    started.until_ready();
+    killed.elapsed().as_secs_f64()
 }

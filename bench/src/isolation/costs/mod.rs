@@ -25,7 +25,7 @@ pub use sides::{BenchGuest, run_as_runtime};
 pub(super) fn measure(quick: bool, seed: u64, results: &mut BenchResults) -> IsolationCosts {
     let mut costs = IsolationCosts::default();
     wakes::measure(quick, seed, results, &mut costs);
-    access::measure(quick, results, &mut costs);
+    access::measure(quick, seed, results, &mut costs);
     live::measure(quick, results, &mut costs);
     faults::measure(quick, results, &mut costs);
     results.notes.extend([
@@ -34,15 +34,17 @@ pub(super) fn measure(quick: bool, seed: u64, results: &mut BenchResults) -> Iso
              order by the seed {seed}, and each is started again for its turn. All reach the same \
              decisions."
         ),
-        "*Native function* has the same arithmetic, and calls the host's functions without a \
-         border; it has no component, no memory of its own, no fuel, epochs or handles."
+        "*Native function* has the same arithmetic, and calls the host's functions directly: without \
+         a component, its memory, fuel, epochs and handles. It has the same rings, replay and \
+         decisions around it."
             .to_owned(),
         "*Wasm* is the product, with fuel and epochs; the others have the same host around a \
          component that was compiled with fewer checks. No deadline applies in a replay."
             .to_owned(),
-        "*CPU per wake* is that of all processes of a replay, with reading the drive and writing \
-         the decisions, without their start. A replay in Python has two processes, which both read \
-         the drive."
+        "*CPU per wake of a replay* is that of all of its processes, with reading the drive and \
+         writing the decisions, without their start. A replay in Python has two processes, which \
+         both read the drive. That of a live run is the process of the lambda alone, which sleeps \
+         between wakes."
             .to_owned(),
     ]);
     costs

@@ -1,8 +1,8 @@
 //! The lambdas of the comparison as native functions in the runtime's process.
 //!
 //! Included: the same arithmetic as in the component, compiled for this processor's baseline, and
-//! the same host functions, called without a border: rings, fields, frames, triggers. Not included:
-//! a component, its memory, fuel, epochs, handles. A defect would end the process.
+//! the same host functions, called directly: rings, fields, frames, triggers. Not included: a
+//! component, its memory, fuel, epochs, handles. A defect would end the process.
 
 use std::fmt::Display;
 use std::sync::Arc;

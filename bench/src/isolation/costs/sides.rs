@@ -51,9 +51,11 @@ impl WakeSide {
     pub(super) const NATIVE: Self = Self::Bench(BenchGuest::Native);
     pub(super) const WASM: Self = Self::Product(Twin::Rust);
     pub(super) const PYTHON: Self = Self::Product(Twin::Python);
+    pub(super) const UNCHECKED: Self = Self::Bench(BenchGuest::Unchecked);
+    pub(super) const FEWER: [Self; 4] = [Self::NATIVE, Self::UNCHECKED, Self::WASM, Self::PYTHON];
     pub(super) const ALL: [Self; 6] = [
         Self::NATIVE,
-        Self::Bench(BenchGuest::Unchecked),
+        Self::UNCHECKED,
         Self::Bench(BenchGuest::Fuel),
         Self::Bench(BenchGuest::Epochs),
         Self::WASM,

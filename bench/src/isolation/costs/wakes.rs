@@ -11,9 +11,9 @@ use gleaner_lambda::{Decision, twins_differ};
 use gleaner_tests::drive::{TopicMessages, of_topics};
 use gleaner_tests::{LambdaCopy, TempFolder};
 
-use super::drives;
+use super::drives::{self, CAMERA, IMU};
 use super::road::Road;
-use super::sides::{BenchGuest, WakeSide, WakeTurn};
+use super::sides::{WakeSide, WakeTurn};
 use crate::measure::{Twin, shuffled};
 use crate::rtt::Workload;
 
@@ -29,6 +29,9 @@ struct RecordedWorkload {
     name: &'static str,
     drive: PathBuf,
     lambdas: [LambdaCopy; 2],
+    sides: &'static [WakeSide],
+    /// Whether its wakes take more of the CPU than starts vary.
+    has_cpu: bool,
     /// Names of the kinds of its wakes, and the one of each wake.
     kinds: &'static [&'static str],
     kind: fn(&[Decision]) -> Vec<usize>,
@@ -59,21 +62,25 @@ pub(super) fn measure(
         let values = workload.measure(turns, &mut random);
         for (index, kind) in workload.kinds.iter().enumerate() {
             let name = format!("{}, {kind}: time per wake", workload.name);
-            let group = group(name, &values, |side| &side.wakes[index]);
+            let group = group(name, workload.sides, &values, |side| &side.wakes[index]);
             costs.wakes.push(costs_of(&format!("{}, {kind}", workload.name), &group));
             results.groups.push(group);
         }
-        cpu.push(group(format!("{}: CPU per wake", workload.name), &values, |side| &side.cpu));
+        if workload.has_cpu {
+            let name = format!("{}: CPU per wake of a replay", workload.name);
+            cpu.push(group(name, workload.sides, &values, |side| &side.cpu));
+        }
     }
     results.groups.append(&mut cpu);
 }
 
 fn group(
     name: String,
+    sides: &[WakeSide],
     values: &[SideValues],
     of: impl Fn(&SideValues) -> &Vec<f64>,
 ) -> SeriesGroup {
-    let series = WakeSide::ALL.iter().zip(values).map(|(side, values)| Series {
+    let series = sides.iter().zip(values).map(|(side, values)| Series {
         name: side.name().to_owned(),
         values: of(values).clone(),
         ..Series::default()
@@ -93,7 +100,7 @@ fn costs_of(name: &str, group: &SeriesGroup) -> WakeCosts {
         found.map(|series| &series.values[..])
     };
     let median = |side| values(side).map(|values| quantile(values, 0.5));
-    let unchecked = values(WakeSide::Bench(BenchGuest::Unchecked));
+    let unchecked = values(WakeSide::UNCHECKED);
     let checks = unchecked
         .zip(values(WakeSide::WASM))
         .and_then(|(unchecked, wasm)| MeasuredDifference::between(unchecked, wasm));
@@ -124,6 +131,9 @@ impl RecordedWorkload {
             name: "IMU, FFT",
             drive: of_topics(&folder, &[imu]),
             lambdas: [Twin::Rust, Twin::Python].map(|kind| Workload::ImuFft.lambda(kind)),
+            // Two of them take most of a quick run to compile.
+            sides: if quick { &WakeSide::FEWER } else { &WakeSide::ALL },
+            has_cpu: true,
             kinds: &["a wake with a spectrum of 128 samples", "another wake"],
             kind: has_no_spectrum,
             _folder: folder,
@@ -138,6 +148,8 @@ impl RecordedWorkload {
             name: "1080p, Brake + Dark",
             drive: drives::with_frames(&folder, [IMU, CAMERA], 60, frames),
             lambdas: [Twin::Rust, Twin::Python].map(|kind| Workload::Brake1080.lambda(kind)),
+            sides: &WakeSide::ALL,
+            has_cpu: false,
             kinds: &["a wake with a mean luma by the host"],
             kind: |decisions| vec![0; decisions.len()],
             _folder: folder,
@@ -153,8 +165,8 @@ impl RecordedWorkload {
         let mut values: BTreeMap<usize, SideValues> = BTreeMap::new();
         let mut expected: Option<Vec<Decision>> = None;
         for _ in 0..turns {
-            for index in shuffled(WakeSide::ALL.len(), random) {
-                let side = WakeSide::ALL[index];
+            for index in shuffled(self.sides.len(), random) {
+                let side = self.sides[index];
                 let turn = side.replay(self.lambda(side), &self.drive, &[]);
                 let expected = expected.get_or_insert_with(|| turn.decisions.clone());
                 assert_eq!(expected.len(), turn.decisions.len(), "{}: {}", self.name, side.name());
@@ -163,7 +175,7 @@ impl RecordedWorkload {
                 }
                 let values = values.entry(index).or_default();
                 values.add(self, &turn);
-                if side.has_own_cpu() {
+                if self.has_cpu && side.has_own_cpu() {
                     let begin = side.replay(self.lambda(side), &self.drive, &BEGIN);
                     let wakes = turn.decisions.len() - begin.decisions.len();
                     values.cpu.push((turn.cpu_us - begin.cpu_us) / wakes as f64);
@@ -196,7 +208,3 @@ fn has_no_spectrum(decisions: &[Decision]) -> Vec<usize> {
     };
     decisions.iter().map(has_none).collect()
 }
-
-/// Topics of the lambdas.
-const IMU: &str = "/imu/synthetic";
-const CAMERA: &str = "/camera/synthetic/image_raw";
