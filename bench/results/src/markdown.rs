@@ -66,7 +66,9 @@ impl BenchResults {
 impl SeriesGroup {
     /// Returns the heads of the table of its series.
     pub(crate) fn heads(&self) -> Vec<String> {
-        let heads = [&["side", "answered of sent"][..], &STATISTICS].concat();
+        let has_reception = self.series.iter().any(|series| series.reception.is_some());
+        let count = if has_reception { "answered of sent" } else { "values" };
+        let heads = [&["side", count][..], &STATISTICS].concat();
         heads.into_iter().map(str::to_owned).chain(self.details()).collect()
     }
 

@@ -53,7 +53,8 @@ pub fn measure(quick: bool, options: &IsolationOptions, results: &mut BenchResul
     costs.start_ms = starts(quick, results);
     if !options.no_attacks {
         match attacks(quick, &mut results.figures) {
-            Ok(counts) => costs.attacks = Some(counts),
+            // A quick run compares nothing.
+            Ok(counts) => costs.attacks = (counts.compared > 0).then_some(counts),
             Err(why) => results.notes.push(format!("No attacks were measured: {why}.")),
         }
     }

@@ -91,6 +91,27 @@ fn group(
     }
 }
 
+/// Repeated work, native or in a component.
+struct TimedWork<'a> {
+    at: usize,
+    name: &'static str,
+    repeated: u64,
+    run: Box<dyn FnMut() + 'a>,
+}
+
+impl<'a> TimedWork<'a> {
+    /// Work that is repeated here.
+    fn looped(at: usize, name: &'static str, repeated: u64, mut once: impl FnMut() + 'a) -> Self {
+        Self { at, name, repeated, run: Box::new(move || (0..repeated).for_each(|_| once())) }
+    }
+
+    /// Work that the bench lambda repeats in a wake.
+    fn hosted(name: &'static str, repeated: u64) -> Self {
+        let mut kernel = HostedKernel::new(name, repeated);
+        Self { at: WASM, name, repeated, run: Box::new(move || kernel.frame()) }
+    }
+}
+
 /// Measures calls of a component and native ones, in an order by `random` in each round.
 fn in_this_process(rounds: usize, random: &mut u64) -> [Times; 2] {
     let inputs = FilledInputs::new(Vec::new());
@@ -98,39 +119,31 @@ fn in_this_process(rounds: usize, random: &mut u64) -> [Times; 2] {
     let sample = inputs.camera.newest().expect("no holds are refused").expect("a frame");
     let frame = sample.as_frame().expect("an image");
     let source = vec![7_u8; FRAME_BYTES];
-    let mut target = vec![0_u8; FRAME_BYTES];
-    let mut works: Vec<(usize, &str, u64, Box<dyn FnMut() + '_>)> = vec![
-        (NATIVE, "call", 100_000, Box::new(|| drop(black_box(Some(inputs.session.now_ns()))))),
-        (
-            NATIVE,
-            "column",
-            200,
-            Box::new(|| drop(black_box(inputs.imu.column(&field, COLUMN)).expect("a column"))),
-        ),
-        (NATIVE, "luma-by-host", 4, Box::new(|| drop(black_box(frame.mean_luma(None))))),
-        (
-            NATIVE,
-            "memcpy",
-            4,
-            Box::new(|| black_box(&mut target).copy_from_slice(black_box(&source))),
-        ),
-    ];
-    let hosted = [("call", 100_000), ("column", 200), ("stream", 4), ("copy", 4), ("copy-luma", 4)];
-    for (work, repeated) in hosted.into_iter().chain([("luma-by-host", 4)]) {
-        let mut kernel = HostedKernel::new(work, repeated);
-        works.push((WASM, work, repeated, Box::new(move || kernel.frame())));
-    }
+    let mut target = source.clone();
     let mut empty = HostedKernel::new("copy", 0);
-    works.push((WASM, "empty", 2000, Box::new(move || empty.tick())));
-    // A frame makes a component repeat its work by itself.
-    let is_repeated_here = |at: usize, work: &str| at == NATIVE || work == "empty";
+    let mut works = [
+        TimedWork::looped(NATIVE, "call", 100_000, || _ = black_box(inputs.session.now_ns())),
+        TimedWork::looped(NATIVE, "column", 200, || {
+            drop(black_box(inputs.imu.column(&field, COLUMN)).expect("a column"));
+        }),
+        TimedWork::looped(NATIVE, "luma-by-host", 4, || drop(black_box(frame.mean_luma(None)))),
+        TimedWork::looped(NATIVE, "memcpy", 4, || {
+            black_box(&mut target).copy_from_slice(black_box(&source));
+        }),
+        TimedWork::looped(WASM, "empty", 2000, || empty.tick()),
+        TimedWork::hosted("call", 100_000),
+        TimedWork::hosted("column", 200),
+        TimedWork::hosted("luma-by-host", 4),
+        TimedWork::hosted("stream", 4),
+        TimedWork::hosted("copy", 4),
+        TimedWork::hosted("copy-luma", 4),
+    ];
     let mut times = [Times::new(), Times::new()];
     for _ in 0..rounds {
         for index in shuffled(works.len(), random) {
-            let (at, name, repeated, work) = &mut works[index];
-            let calls = if is_repeated_here(*at, name) { *repeated } else { 1 };
-            let us = timed(*repeated, || (0..calls).for_each(|_| work())).0;
-            times[*at].entry(name).or_default().push(1e3 * us);
+            let work = &mut works[index];
+            let us = timed(work.repeated, || (work.run)()).0;
+            times[work.at].entry(work.name).or_default().push(1e3 * us);
         }
     }
     times

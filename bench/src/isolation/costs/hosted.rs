@@ -36,7 +36,6 @@ pub(super) struct FilledInputs {
 pub(super) struct HostedKernel {
     guest: WasmGuest,
     inputs: FilledInputs,
-    rounds: u64,
 }
 
 impl FilledInputs {
@@ -91,15 +90,10 @@ impl HostedKernel {
         let guest = WasmGuest::new(loaded, inputs.session.clone(), &inputs.limits, None);
         let mut guest = guest.expect("a guest");
         guest.init().expect("init");
-        let mut hosted = Self { guest, inputs, rounds };
+        let mut hosted = Self { guest, inputs };
         // The first wake grows the guest's memory.
         hosted.frame();
         hosted
-    }
-
-    /// Repetitions of the work in [`frame`](Self::frame).
-    pub(super) fn rounds(&self) -> u64 {
-        self.rounds
     }
 
     /// A wake by the frame.
