@@ -3,6 +3,7 @@
 use std::fmt;
 use std::path::{Path, PathBuf};
 
+use gleaner_bench_results::Summary;
 use gleaner_tests::root;
 use rustix::time::{ClockId, clock_gettime};
 
@@ -35,6 +36,11 @@ impl Twin {
     pub fn example(self, name: &str) -> PathBuf {
         root().join("examples").join(name).join(self.folder())
     }
+}
+
+/// The median of `values`, as tables have it; `None` without values.
+pub fn median(values: &[f64]) -> Option<f64> {
+    Summary::of(values).map(|summary| summary.median)
 }
 
 /// Microseconds for each of the `times` repetitions of `work`, and its result. Measured in CPU time

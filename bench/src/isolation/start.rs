@@ -8,8 +8,8 @@ use gleaner_tests::drive::{CdrBuilder, IMAGE, one_topic};
 use gleaner_tests::{TempFolder, program, root, runtime};
 
 use crate::live::lambda;
-use crate::measure::Twin;
-use gleaner_bench_results::{Figure, KindValues, quantile};
+use crate::measure::{Twin, median};
+use gleaner_bench_results::{Figure, KindValues};
 
 /// Goals for the lifetime in ms: wasm, and Python without imports of the lambda.
 const GOALS_MS: [(Twin, f64); 2] = [(Twin::Rust, 10.0), (Twin::Python, 150.0)];
@@ -64,7 +64,7 @@ pub(super) fn figures(rounds: usize, figures: &mut Vec<Figure>) -> KindValues {
         "ms",
         &empty.collect::<Vec<_>>(),
     ));
-    let [wasm, python] = lifetimes.map(|(_, _, [bare, _])| Some(quantile(&bare, 0.5)));
+    let [wasm, python] = lifetimes.map(|(_, _, [bare, _])| median(&bare));
     KindValues { native: None, wasm, python }
 }
 

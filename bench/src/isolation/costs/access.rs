@@ -6,13 +6,13 @@ use std::collections::BTreeMap;
 use std::hint::black_box;
 
 use gleaner_bench_results::{
-    BenchResults, Figure, IsolationCosts, KindValues, Series, SeriesGroup, quantile,
+    BenchResults, Figure, IsolationCosts, KindValues, Series, SeriesGroup,
 };
 use gleaner_tests::{TempFolder, replay, root};
 
 use super::drives::{self, FRAME_BYTES};
 use super::hosted::{COLUMN, FilledInputs, HostedKernel};
-use crate::measure::{shuffled, timed};
+use crate::measure::{median, shuffled, timed};
 
 /// Name of the row of a copy without Gleaner.
 const MEMCPY: &str = "memcpy";
@@ -34,7 +34,7 @@ pub(super) fn measure(
     let rounds = if quick { 1 } else { 31 };
     let [native, wasm] = in_this_process(rounds, &mut seed.max(1));
     let python = in_python(quick);
-    let median = |times: &Times, name| times.get(name).map(|times| quantile(times, 0.5));
+    let median = |times: &Times, name| times.get(name).and_then(|times| median(times));
     costs.host_call_ns = KindValues {
         native: median(&native, "call"),
         wasm: median(&wasm, "call"),

@@ -3,15 +3,13 @@
 
 use std::path::Path;
 
-use gleaner_bench_results::{
-    BenchResults, IsolationCosts, KindValues, Series, SeriesGroup, quantile,
-};
+use gleaner_bench_results::{BenchResults, IsolationCosts, KindValues, Series, SeriesGroup};
 use gleaner_lambda::{Decision, FaultKind};
 use gleaner_protocol::Report;
 use gleaner_tests::live::{decisions, run_all};
 use gleaner_tests::{LambdaCopy, TempFolder, replay, sample_drive};
 
-use crate::measure::Twin;
+use crate::measure::{Twin, median};
 
 const TRAP: &str = "wasm: trap";
 const EXCEPTION: &str = "Python: exception";
@@ -35,7 +33,7 @@ pub(super) fn measure(quick: bool, results: &mut BenchResults, costs: &mut Isola
         .collect();
     measured.extend(
         LIVE.into_iter()
-            .zip(live(if quick { 2 } else { 21 }))
+            .zip(live(if quick { 1 } else { 21 }))
             .map(|((row, _), decisions)| (row, decisions, FaultKind::Deadline)),
     );
     let (mut faulted, mut next) = (Vec::new(), Vec::new());
@@ -56,7 +54,7 @@ pub(super) fn measure(quick: bool, results: &mut BenchResults, costs: &mut Isola
     }
     let median = |row: &str| {
         let found = next.iter().find(|series| series.name == row);
-        found.map(|series| quantile(&series.values, 0.5))
+        found.and_then(|series| median(&series.values))
     };
     costs.restarted_ms = KindValues { native: None, wasm: median(TRAP), python: median(EXCEPTION) };
     for (name, series) in [

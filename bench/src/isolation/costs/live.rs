@@ -5,7 +5,7 @@ use std::path::Path;
 use std::time::Instant;
 
 use gleaner_bench_results::{
-    BenchResults, Growth, GrowthCurve, IsolationCosts, KindValues, Series, SeriesGroup, quantile,
+    BenchResults, Growth, GrowthCurve, IsolationCosts, KindValues, Series, SeriesGroup,
 };
 use gleaner_protocol::Report;
 use gleaner_tests::live::{RunningProgram, run_all};
@@ -14,14 +14,21 @@ use rustix::process::{Pid, Signal, kill_process};
 
 use super::drives::{self, CAMERA, IMU};
 use crate::live::LiveProcesses;
-use crate::measure::{Twin, pss_mib};
+use crate::measure::{Twin, median, pss_mib};
 use crate::rtt::Workload;
 
 const KINDS: [Twin; 2] = [Twin::Rust, Twin::Python];
-/// Wakes by the IMU before anything is read: some have computed a spectrum.
-const WARM_UP: u64 = 160;
-/// The same for frames.
-const WARM_UP_FRAMES: u64 = 5;
+/// The length of a run on frames.
+const FRAMES: LiveLength = LiveLength { warm_up: 5, statuses: 3 };
+
+/// The length of a run.
+#[derive(Clone, Copy)]
+struct LiveLength {
+    /// Wakes before anything is read. By the IMU, 160 include some with a spectrum.
+    warm_up: u64,
+    /// Statuses that are read, one in a second.
+    statuses: usize,
+}
 
 /// Measurements of one kind.
 #[derive(Default)]
@@ -35,15 +42,17 @@ struct LiveKind {
 
 pub(super) fn measure(quick: bool, results: &mut BenchResults, costs: &mut IsolationCosts) {
     eprintln!("live processes");
-    let (rounds, counts, statuses): (_, &[usize], _) =
-        if quick { (1, &[1], 2) } else { (5, &[1, 2, 4], 5) };
+    let (rounds, counts, length): (_, &[usize], _) = match quick {
+        true => (1, &[1], LiveLength { warm_up: 1, statuses: 2 }),
+        false => (5, &[1, 2, 4], LiveLength { warm_up: 160, statuses: 5 }),
+    };
     let mut kinds = [LiveKind::default(), LiveKind::default()];
     let folder = TempFolder::new();
     // Enough for three statuses, one in a second.
     let frames = (!quick).then(|| drives::with_frames(&folder, [IMU, CAMERA], 60, 40));
     for _ in 0..rounds {
         for (kind, live) in KINDS.into_iter().zip(&mut kinds) {
-            counts.iter().for_each(|count| live.run_imu(kind, *count, statuses));
+            counts.iter().for_each(|count| live.run_imu(kind, *count, length));
             if let Some(frames) = &frames {
                 live.run_camera(kind, frames);
             }
@@ -56,7 +65,7 @@ pub(super) fn measure(quick: bool, results: &mut BenchResults, costs: &mut Isola
         if kinds.iter().all(|live| !of(live).is_empty()) {
             let title = format!("{name}: CPU of the lambda's process per wake");
             results.groups.push(group(&title, "us", &kinds, of));
-            let medians = values(&kinds, |live| Some(quantile(of(live), 0.5)));
+            let medians = values(&kinds, |live| median(of(live)));
             costs.live_cpu_us.push((name.to_owned(), medians));
         }
     }
@@ -87,7 +96,7 @@ pub(super) fn measure(quick: bool, results: &mut BenchResults, costs: &mut Isola
         let grown = live.memory_of(*last) - live.memory_of(*first);
         Some(grown / (last - first) as f64)
     });
-    costs.killed_s = values(&kinds, |live| Some(quantile(&live.killed_s, 0.5)));
+    costs.killed_s = values(&kinds, |live| median(&live.killed_s));
 }
 
 fn values([wasm, python]: &[LiveKind; 2], of: impl Fn(&LiveKind) -> Option<f64>) -> KindValues {
@@ -117,7 +126,7 @@ fn group(
 impl LiveKind {
     /// Runs `count` lambdas on the IMU of the sample drive. A single one is also measured by its
     /// CPU time, and killed.
-    fn run_imu(&mut self, kind: Twin, count: usize, statuses: usize) {
+    fn run_imu(&mut self, kind: Twin, count: usize, length: LiveLength) {
         let folder = format!("examples/imu-fft/{}", kind.folder());
         let copies: Vec<_> = (0..count)
             .map(|index| LambdaCopy::named(&folder, &format!("imu-fft-{index}")))
@@ -125,9 +134,9 @@ impl LiveKind {
         let out = TempFolder::new();
         let started = run_on(&sample_drive(), &copies, &out);
         if count == 1 {
-            self.imu_cpu_us.extend(cpu_per_wake(&started, WARM_UP, statuses));
+            self.imu_cpu_us.extend(cpu_per_wake(&started, length));
         } else {
-            until_all_warm(&started, count);
+            until_all_warm(&started, count, length.warm_up);
         }
         let processes = LiveProcesses::of(&started);
         let memory = processes.shims.iter().chain(&processes.lambdas).map(|pid| pss_mib(*pid));
@@ -143,14 +152,14 @@ impl LiveKind {
     fn run_camera(&mut self, kind: Twin, drive: &Path) {
         let out = TempFolder::new();
         let started = run_on(drive, &[Workload::Brake1080.lambda(kind)], &out);
-        self.camera_cpu_us.extend(cpu_per_wake(&started, WARM_UP_FRAMES, 3));
+        self.camera_cpu_us.extend(cpu_per_wake(&started, FRAMES));
         started.signal("INT");
         started.finish();
     }
 
     fn memory_of(&self, count: usize) -> f64 {
         let of_count = self.memory.iter().filter(|(lambdas, _)| *lambdas == count);
-        quantile(&of_count.map(|(_, megabytes)| *megabytes).collect::<Vec<_>>(), 0.5)
+        median(&of_count.map(|(_, megabytes)| *megabytes).collect::<Vec<_>>()).unwrap_or(f64::NAN)
     }
 }
 
@@ -165,7 +174,8 @@ fn run_on(drive: &Path, lambdas: &[LambdaCopy], out: &TempFolder) -> RunningProg
 }
 
 /// Returns the CPU time of a lambda's process per wake in us, between each two of its statuses.
-fn cpu_per_wake(started: &RunningProgram, warm_up: u64, statuses: usize) -> Vec<f64> {
+fn cpu_per_wake(started: &RunningProgram, length: LiveLength) -> Vec<f64> {
+    let LiveLength { warm_up, statuses } = length;
     let mut before = started.until_live("the first wakes", |live| live.wakes >= warm_up);
     let between = |_| {
         let live = started.until_live("a status", |_| true);
@@ -176,11 +186,11 @@ fn cpu_per_wake(started: &RunningProgram, warm_up: u64, statuses: usize) -> Vec<
     (1..statuses).map(between).collect()
 }
 
-fn until_all_warm(started: &RunningProgram, count: usize) {
+fn until_all_warm(started: &RunningProgram, count: usize, warm_up: u64) {
     let mut warm = Vec::new();
     started.until_named("the first spectra of all", |name, report| {
         if let Report::Live(live) = report
-            && live.wakes >= WARM_UP
+            && live.wakes >= warm_up
             && !warm.contains(&name)
         {
             warm.push(name);

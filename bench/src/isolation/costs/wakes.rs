@@ -5,7 +5,6 @@ use std::path::{Path, PathBuf};
 
 use gleaner_bench_results::{
     BenchResults, IsolationCosts, KindValues, MeasuredDifference, Series, SeriesGroup, WakeCosts,
-    quantile,
 };
 use gleaner_lambda::{Decision, twins_differ};
 use gleaner_tests::drive::{TopicMessages, of_topics};
@@ -14,7 +13,7 @@ use gleaner_tests::{LambdaCopy, TempFolder};
 use super::drives::{self, CAMERA, IMU};
 use super::road::Road;
 use super::sides::{WakeSide, WakeTurn};
-use crate::measure::{Twin, shuffled};
+use crate::measure::{Twin, median, shuffled};
 use crate::rtt::Workload;
 
 /// Wakes without a spectrum that are kept of a turn: all of them would be most of the results.
@@ -99,7 +98,7 @@ fn costs_of(name: &str, group: &SeriesGroup) -> WakeCosts {
         let found = group.series.iter().find(|series| series.name == side.name());
         found.map(|series| &series.values[..])
     };
-    let median = |side| values(side).map(|values| quantile(values, 0.5));
+    let median = |side| values(side).and_then(median);
     let unchecked = values(WakeSide::UNCHECKED);
     let checks = unchecked
         .zip(values(WakeSide::WASM))
