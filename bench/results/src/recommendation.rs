@@ -201,7 +201,8 @@ impl WakeCosts {
                 )
             })
         });
-        let checks = self.checks.map(|checks| match checks.is_seen() {
+        let checks = self.checks.filter(|checks| checks.interval.is_some());
+        let checks = checks.map(|checks| match checks.is_seen() {
             true => format!(
                 "Fuel and epochs change the time of this wake by {:+.0} %.",
                 100.0 * (checks.ratio - 1.0)
@@ -298,6 +299,9 @@ mod tests {
         let same = MeasuredDifference::between(&values(100.0), &values(100.0));
         let said = text(&wake(both(1.0, 2.0), same));
         assert!(said.contains("A cost of fuel and epochs was not seen in it."), "{said}");
+        let few = MeasuredDifference::between(&[1.0], &[1.0]);
+        assert!(!text(&wake(both(1.0, 2.0), few)).contains("Fuel and epochs"));
+        assert!(!text(&wake(both(1.0, 2.0), few)).contains("fuel and epochs"));
     }
 
     #[test]

@@ -42,7 +42,7 @@ pub(super) fn measure(
     };
     let of_kinds =
         |name| [("native", &native, name), ("wasm", &wasm, name), ("Python", &python, name)];
-    results.groups.push(group("A host call, `now-ns`", ("ns", 1.0), "native", &of_kinds("call")));
+    results.groups.push(group("A host call, now-ns", ("ns", 1.0), "native", &of_kinds("call")));
     let name = "A field of 256 samples, as a column";
     results.groups.push(group(name, ("us", 1e3), "native", &of_kinds("column")));
     let frame = [

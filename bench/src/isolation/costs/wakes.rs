@@ -17,7 +17,7 @@ use crate::measure::{Twin, median, shuffled};
 use crate::rtt::Workload;
 
 /// Wakes without a spectrum that are kept of a turn: all of them would be most of the results.
-const OTHER_WAKES: usize = 2_000;
+const OTHER_WAKES: usize = 1_000;
 /// Length of a window of `examples/imu-fft` in seconds.
 const WINDOW_S: f64 = 1.25;
 /// The part of a drive that is replayed to know what all but the wakes takes.
@@ -42,6 +42,8 @@ struct RecordedWorkload {
 struct SideValues {
     /// Times of wakes by their kind, in us.
     wakes: Vec<Vec<f64>>,
+    /// Their median in each turn.
+    medians: Vec<Vec<f64>>,
     /// CPU time per wake of each turn, in us.
     cpu: Vec<f64>,
 }
@@ -54,7 +56,7 @@ pub(super) fn measure(
     costs: &mut IsolationCosts,
 ) {
     let mut random = seed.max(1);
-    let turns = if quick { 1 } else { 9 };
+    let turns = if quick { 1 } else { 15 };
     let mut cpu = Vec::new();
     for workload in [RecordedWorkload::imu(quick), RecordedWorkload::camera(quick)] {
         eprintln!("{}: time and CPU per wake", workload.name);
@@ -62,7 +64,11 @@ pub(super) fn measure(
         for (index, kind) in workload.kinds.iter().enumerate() {
             let name = format!("{}, {kind}: time per wake", workload.name);
             let group = group(name, workload.sides, &values, |side| &side.wakes[index]);
-            costs.wakes.push(costs_of(&format!("{}, {kind}", workload.name), &group));
+            let medians = |of: WakeSide| {
+                let place = workload.sides.iter().position(|side| *side == of);
+                place.map(|place| &values[place].medians[index][..])
+            };
+            costs.wakes.push(costs_of(&format!("{}, {kind}", workload.name), &group, medians));
             results.groups.push(group);
         }
         if workload.has_cpu {
@@ -92,16 +98,19 @@ fn group(
     }
 }
 
-/// Takes the medians of a group, and the cost of checks if it is seen.
-fn costs_of(name: &str, group: &SeriesGroup) -> WakeCosts {
-    let values = |side: WakeSide| {
+/// Takes the medians of a group, and compares a component with one without checks by the medians of
+/// their turns: the speed of the machine differs between turns more than within one.
+fn costs_of<'a>(
+    name: &str,
+    group: &SeriesGroup,
+    of_turns: impl Fn(WakeSide) -> Option<&'a [f64]>,
+) -> WakeCosts {
+    let median = |side: WakeSide| {
         let found = group.series.iter().find(|series| series.name == side.name());
-        found.map(|series| &series.values[..])
+        found.and_then(|series| median(&series.values))
     };
-    let median = |side| values(side).and_then(median);
-    let unchecked = values(WakeSide::UNCHECKED);
-    let checks = unchecked
-        .zip(values(WakeSide::WASM))
+    let checks = of_turns(WakeSide::UNCHECKED)
+        .zip(of_turns(WakeSide::WASM))
         .and_then(|(unchecked, wasm)| MeasuredDifference::between(unchecked, wasm));
     WakeCosts {
         name: name.to_owned(),
@@ -187,13 +196,16 @@ impl RecordedWorkload {
 
 impl SideValues {
     fn add(&mut self, workload: &RecordedWorkload, turn: &WakeTurn) {
-        self.wakes.resize(workload.kinds.len(), Vec::new());
-        let mut kept = vec![0; workload.kinds.len()];
+        let mut wakes = vec![Vec::new(); workload.kinds.len()];
         for (decision, kind) in turn.decisions.iter().zip((workload.kind)(&turn.decisions)) {
-            kept[kind] += 1;
-            if kind == 0 || kept[kind] <= OTHER_WAKES {
-                self.wakes[kind].push(decision.run_ns as f64 / 1e3);
-            }
+            wakes[kind].push(decision.run_ns as f64 / 1e3);
+        }
+        self.wakes.resize(wakes.len(), Vec::new());
+        self.medians.resize(wakes.len(), Vec::new());
+        for (kind, wakes) in wakes.iter().enumerate() {
+            self.medians[kind].extend(median(wakes));
+            let kept = if kind == 0 { wakes.len() } else { OTHER_WAKES.min(wakes.len()) };
+            self.wakes[kind].extend(&wakes[..kept]);
         }
     }
 }
