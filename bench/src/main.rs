@@ -14,6 +14,7 @@ mod record;
 mod replay;
 mod rtt;
 
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode};
 
@@ -46,8 +47,12 @@ enum BenchCommand {
     },
     /// Samples that one and several lambdas receive, and their costs; needs gleaner-player.
     Scale,
-    /// Effect of a misbehaving lambda on others, and the start of a lambda; needs gleaner-player.
-    Isolation,
+    /// What isolation costs: the same lambda as native code, in wasm and in Python; memory, starts
+    /// and faults; and the effect of a misbehaving lambda on others. Needs gleaner-player.
+    Isolation {
+        #[command(flatten)]
+        options: isolation::IsolationOptions,
+    },
     /// The start of a lambda.
     ColdStart,
     /// Replays: speed, memory, and the cost of a journal and of clips.
@@ -56,11 +61,20 @@ enum BenchCommand {
     Record,
     /// Drives of 2 GB in each storage format; takes 5 GB of disk.
     Drives,
-    /// Arithmetic in lambdas against the same code natively, and calls between lambda and host.
+    /// Arithmetic in lambdas against the same code natively.
     Kernels,
     /// Detectors: a frame's way through gleaner-inference, by rten and, if ORT_DYLIB_PATH is set,
     /// by ONNX Runtime, against a plain Python program; several lambdas of one model.
     Inference,
+    /// Runs as gleaner-runtime, with a guest that the product does not have.
+    #[command(hide = true)]
+    Guest {
+        /// The guest.
+        guest: isolation::BenchGuest,
+        /// Arguments of gleaner-runtime.
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+        arguments: Vec<OsString>,
+    },
     /// Writes a model of the shape of YOLO11, with random weights, and measures nothing.
     Model {
         /// Scale of the model.
@@ -81,6 +95,9 @@ fn main() -> ExitCode {
     let args = Args::parse();
     let done = match &args.command {
         BenchCommand::Model { scale, file } => return write_model(*scale, file),
+        BenchCommand::Guest { guest, arguments } => {
+            return isolation::run_as_runtime(*guest, arguments.clone());
+        }
         BenchCommand::Compare { a, b } => compare(a, b),
         command => measure(command, &args),
     };
@@ -113,20 +130,14 @@ fn measure(command: &BenchCommand, args: &Args) -> Result<ExitCode, Failure> {
     match command {
         BenchCommand::Rtt { options } => rtt::measure(quick, options, &mut results),
         BenchCommand::Scale => live::loads(quick, &mut results),
-        BenchCommand::Isolation => match isolation::figures(quick) {
-            Ok(figures) => results.figures = figures,
-            Err(why) => {
-                println!("skipped: {why}");
-                return Ok(ExitCode::SUCCESS);
-            }
-        },
-        BenchCommand::ColdStart => results.figures = isolation::starts(quick),
+        BenchCommand::Isolation { options } => isolation::measure(quick, options, &mut results),
+        BenchCommand::ColdStart => drop(isolation::starts(quick, &mut results)),
         BenchCommand::Replay => results.figures = replay::figures(quick),
         BenchCommand::Record => results.figures = record::figures(quick),
         BenchCommand::Drives => results.figures = drives::figures(quick),
         BenchCommand::Kernels => results.figures = kernels::figures(quick),
         BenchCommand::Inference => inference::measure(quick, &mut results),
-        BenchCommand::Model { .. } | BenchCommand::Compare { .. } => {}
+        BenchCommand::Guest { .. } | BenchCommand::Model { .. } | BenchCommand::Compare { .. } => {}
     }
     results.machine.add_load("load after");
     let folder = args.out.clone().unwrap_or_else(|| root().join("target/bench").join(name));
@@ -142,13 +153,14 @@ impl BenchCommand {
         match self {
             Self::Rtt { .. } => "rtt",
             Self::Scale => "scale",
-            Self::Isolation => "isolation",
+            Self::Isolation { .. } => "isolation",
             Self::ColdStart => "cold-start",
             Self::Replay => "replay",
             Self::Record => "record",
             Self::Drives => "drives",
             Self::Kernels => "kernels",
             Self::Inference => "inference",
+            Self::Guest { .. } => "guest",
             Self::Model { .. } => "model",
             Self::Compare { .. } => "compare",
         }
@@ -156,7 +168,7 @@ impl BenchCommand {
 
     /// Returns whether it needs a network of its own.
     fn is_live(&self) -> bool {
-        matches!(self, Self::Rtt { .. } | Self::Scale | Self::Isolation)
+        matches!(self, Self::Rtt { .. } | Self::Scale | Self::Isolation { .. })
     }
 
     /// Returns whether it has only one process at a time, which is not to move between cores.

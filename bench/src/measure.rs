@@ -3,10 +3,12 @@
 use std::fmt;
 use std::path::{Path, PathBuf};
 
+use gleaner_bench_results::Summary;
 use gleaner_tests::root;
+use rustix::time::{ClockId, clock_gettime};
 
 /// The two versions of a lambda.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, PartialEq, Eq)]
 pub enum Twin {
     Rust,
     Python,
@@ -34,6 +36,36 @@ impl Twin {
     pub fn example(self, name: &str) -> PathBuf {
         root().join("examples").join(name).join(self.folder())
     }
+}
+
+/// The median of `values`, as tables have it; `None` without values.
+pub fn median(values: &[f64]) -> Option<f64> {
+    Summary::of(values).map(|summary| summary.median)
+}
+
+/// Microseconds for each of the `times` repetitions of `work`, and its result. Measured in CPU time
+/// of this thread: other work on the core matters only by its effect on the caches.
+pub fn timed<T>(times: u64, work: impl FnOnce() -> T) -> (f64, T) {
+    let now_us = || {
+        let now = clock_gettime(ClockId::ThreadCPUTime);
+        now.tv_sec as f64 * 1e6 + now.tv_nsec as f64 / 1e3
+    };
+    let started_us = now_us();
+    let result = work();
+    ((now_us() - started_us) / times as f64, result)
+}
+
+/// The numbers below `count` in an order by `random`, a seed above 0, which changes.
+pub fn shuffled(count: usize, random: &mut u64) -> Vec<usize> {
+    let mut order: Vec<usize> = (0..count).collect();
+    // Fisher and Yates.
+    for last in (1..count).rev() {
+        *random ^= *random << 13;
+        *random ^= *random >> 7;
+        *random ^= *random << 17;
+        order.swap(last, (*random % (last as u64 + 1)) as usize);
+    }
+    order
 }
 
 /// Binds this process and its children to the first core that it may use.

@@ -7,8 +7,8 @@ use std::process::Command;
 
 use gleaner_bench_results::Figure;
 use gleaner_protocol::{ReplaySummary, Report, Round};
-use gleaner_tests::drive::{IMAGE, image, imu_only, one_topic};
-use gleaner_tests::{TempFolder, program, replay, root, sample_drive};
+use gleaner_tests::drive::imu_only;
+use gleaner_tests::{TempFolder, program, replay, sample_drive};
 
 use crate::measure::Twin;
 
@@ -51,13 +51,6 @@ pub fn figures(quick: bool) -> Vec<Figure> {
             figures.push(Figure::at_most(&name, "%", 2.0, &growth.collect::<Vec<_>>()));
         }
     }
-    let arrays = (0..rounds.min(5)).flat_map(|_| bench.array_ns()).collect::<Vec<_>>();
-    figures.push(Figure::at_most(
-        "slot to ndarray, 1920x1080 bgr8 (6.2 MB)",
-        "ns",
-        1000.0,
-        &arrays,
-    ));
 
     let outputs = || [("", Vec::new()), ("journal", Vec::new()), ("clips", Vec::new())];
     let [imu, sample] = [
@@ -115,23 +108,14 @@ fn alternate<K: Copy, const N: usize>(
 /// Drives for the replay benchmarks.
 struct ReplayBench {
     sample: PathBuf,
-    frames: PathBuf,
     imu: PathBuf,
-    _folders: [TempFolder; 2],
+    _folder: TempFolder,
 }
 
 impl ReplayBench {
     fn new() -> Self {
         let folder = TempFolder::new();
-        let pixels = vec![99; 1920 * 1080 * 3];
-        let frames = (0..4)
-            .map(|i| (i * 100_000_000, image(1920, 1080, "bgr8", 5760, &pixels)))
-            .collect::<Vec<_>>();
-        let frames =
-            one_topic(&folder, "/camera/front/image_raw", "sensor_msgs/msg/Image", IMAGE, &frames);
-        let imu_folder = TempFolder::new();
-        let imu = imu_only(&imu_folder, 5);
-        Self { sample: sample_drive(), frames, imu, _folders: [folder, imu_folder] }
+        Self { sample: sample_drive(), imu: imu_only(&folder, 5), _folder: folder }
     }
 
     /// `hello` over the sample drive: a wake for each of 4,170 IMU samples.
@@ -228,14 +212,5 @@ impl ReplayBench {
         let rounds = rounds.collect::<Vec<_>>();
         assert!(rounds.len() >= 10, "{}", String::from_utf8_lossy(&output.stderr));
         rounds
-    }
-
-    /// Nanoseconds to create an array over a frame of 6.2 MB, one value for each frame, measured by
-    /// the lambda.
-    fn array_ns(&self) -> Vec<f64> {
-        let lambda = root().join("bench/lambdas/ndarray/python");
-        let run = replay(&lambda, std::slice::from_ref(&self.frames), &[]);
-        let triggers = run.must_exit(0).decisions.iter().flat_map(|decision| &decision.triggers);
-        triggers.filter_map(|trigger| trigger.score).collect()
     }
 }

@@ -215,9 +215,9 @@ pub fn main() -> ExitCode {
     end(cli.job().and_then(|job| job.map_or_else(Ok, |job| run_any(job, worker))))
 }
 
-/// Runs the job inside the interpreter, for `_gleaner`: with the arguments of `gleaner-runtime` and
-/// the guest that `load` creates. Returns the exit code.
-pub fn run_in_python(args: Vec<OsString>, load: Load<'_>) -> u8 {
+/// Runs the job with the arguments of `gleaner-runtime` and the guest that `load` creates: for
+/// `_gleaner`, inside the interpreter, and for benches. Returns the exit code.
+pub fn run_with(args: Vec<OsString>, load: Load<'_>) -> u8 {
     prepare();
     let cli = match Cli::try_parse_from(args) {
         Ok(cli) => cli,

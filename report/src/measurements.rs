@@ -15,6 +15,8 @@ pub struct MeasurementPage {
     pub facts: Vec<(String, String)>,
     /// Sentences that a reader needs to understand the tables.
     pub notes: Vec<String>,
+    /// Sentences that follow from the numbers.
+    pub recommendation: Vec<String>,
     /// Its parts.
     pub sections: Vec<MeasurementSection>,
 }

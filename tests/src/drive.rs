@@ -23,6 +23,40 @@ MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n\
 ================================================================================\n\
 MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n";
 
+/// A topic of a drive.
+pub struct TopicMessages {
+    /// Name of the topic.
+    pub topic: String,
+    /// ROS type.
+    pub type_name: String,
+    /// Definition of the type.
+    pub schema: String,
+    /// Log time in nanoseconds of each message, and its CDR without the encapsulation header.
+    pub messages: Vec<(u64, Vec<u8>)>,
+}
+
+impl TopicMessages {
+    /// The IMU of the sample drive.
+    pub fn sample_imu() -> Self {
+        let bytes = std::fs::read(sample_drive()).expect("the sample drive exists");
+        let messages = mcap::MessageStream::new(&bytes)
+            .expect("a drive")
+            .map(|message| message.expect("a complete drive"));
+        let imu =
+            messages.filter(|message| message.channel.topic == "/imu/data").collect::<Vec<_>>();
+        let schema = imu[0].channel.schema.clone().expect("a schema");
+        Self {
+            topic: "/imu/data".to_owned(),
+            type_name: schema.name.clone(),
+            schema: String::from_utf8_lossy(&schema.data).into_owned(),
+            messages: imu
+                .iter()
+                .map(|message| (message.log_time, message.data[4..].to_vec()))
+                .collect(),
+        }
+    }
+}
+
 /// Writes a drive with one topic. Each of `messages` has a log time in nanoseconds and the CDR
 /// without its encapsulation header.
 pub fn one_topic(
@@ -32,21 +66,34 @@ pub fn one_topic(
     schema: &str,
     messages: &[(u64, Vec<u8>)],
 ) -> PathBuf {
+    let topic = TopicMessages {
+        topic: topic.to_owned(),
+        type_name: type_name.to_owned(),
+        schema: schema.to_owned(),
+        messages: messages.to_vec(),
+    };
+    of_topics(folder, &[topic])
+}
+
+/// Writes a drive with these topics, their messages in the order of time.
+pub fn of_topics(folder: &TempFolder, topics: &[TopicMessages]) -> PathBuf {
     let mut file = Cursor::new(Vec::new());
     let mut writer = mcap::WriteOptions::new()
         .profile("ros2")
         .compression(None)
         .create(&mut file)
         .expect("a drive in memory");
-    let schema = writer.add_schema(type_name, "ros2msg", schema.as_bytes()).expect("a schema");
-    let channel = writer.add_channel(schema, topic, "cdr", &BTreeMap::new()).expect("a channel");
-    for (sequence, (log_time, cdr)) in (1..).zip(messages) {
-        let header = MessageHeader {
-            channel_id: channel,
-            sequence,
-            log_time: *log_time,
-            publish_time: *log_time,
-        };
+    let mut all = Vec::new();
+    for TopicMessages { topic, type_name, schema, messages } in topics {
+        let schema = writer.add_schema(type_name, "ros2msg", schema.as_bytes()).expect("a schema");
+        let channel =
+            writer.add_channel(schema, topic, "cdr", &BTreeMap::new()).expect("a channel");
+        all.extend((1..).zip(messages).map(|(sequence, message)| (channel, sequence, message)));
+    }
+    all.sort_by_key(|(_, _, (log_time, _))| *log_time);
+    for (channel_id, sequence, (log_time, cdr)) in all {
+        let header =
+            MessageHeader { channel_id, sequence, log_time: *log_time, publish_time: *log_time };
         let data = [&[0, 1, 0, 0], cdr.as_slice()].concat();
         writer.write_to_known_channel(&header, &data).expect("a message");
     }
@@ -57,19 +104,13 @@ pub fn one_topic(
 
 /// Writes a drive with only the IMU of the sample drive, `times` times in a row, 40.1 s apart.
 pub fn imu_only(folder: &TempFolder, times: u64) -> PathBuf {
-    let bytes = std::fs::read(sample_drive()).expect("the sample drive exists");
-    let messages = mcap::MessageStream::new(&bytes)
-        .expect("a drive")
-        .map(|message| message.expect("a complete drive"));
-    let imu = messages.filter(|message| message.channel.topic == "/imu/data").collect::<Vec<_>>();
-    let schema = imu[0].channel.schema.clone().expect("a schema");
-    let schema = String::from_utf8_lossy(&schema.data).into_owned();
+    let mut imu = TopicMessages::sample_imu();
     let rounds = (0..times).flat_map(|round| {
-        imu.iter().map(move |message| {
-            (message.log_time + round * 40_100_000_000, message.data[4..].to_vec())
-        })
+        let after = round * 40_100_000_000;
+        imu.messages.iter().map(move |(log_time, cdr)| (log_time + after, cdr.clone()))
     });
-    one_topic(folder, "/imu/data", "sensor_msgs/msg/Imu", &schema, &rounds.collect::<Vec<_>>())
+    imu.messages = rounds.collect();
+    of_topics(folder, &[imu])
 }
 
 /// Writes a drive with the IMU of the sample drive and `topics` further topics, `/many/0` and so

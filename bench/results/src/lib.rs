@@ -5,6 +5,7 @@
 //!   and as a page with plots.
 //! - [`Summary`] has the statistics of a series, and [`MeasuredDifference`] compares two.
 //! - [`Comparison`] compares two runs.
+//! - [`IsolationCosts`] become a recommendation.
 //! - [`Machine`] is where a run took place, and [`PowerMeter`] measures the power that it takes.
 
 mod comparison;
@@ -14,6 +15,7 @@ mod machine;
 mod markdown;
 mod page;
 mod power;
+mod recommendation;
 mod results;
 mod statistics;
 #[cfg(test)]
@@ -25,5 +27,6 @@ pub use figure::{Figure, Goal};
 pub use growth::{Growth, GrowthCurve};
 pub use machine::Machine;
 pub use power::PowerMeter;
+pub use recommendation::{AttackCounts, IsolationCosts, KindValues, WakeCosts};
 pub use results::{BenchResults, Reception, Series, SeriesGroup};
 pub use statistics::{MeasuredDifference, Summary, quantile};

@@ -47,6 +47,12 @@ impl BenchResults {
         for note in &self.notes {
             let _ = writeln!(text, "- {note}");
         }
+        if !self.recommendation.is_empty() {
+            text.push_str("\n## Recommendation\n\n");
+        }
+        for sentence in &self.recommendation {
+            let _ = writeln!(text, "- {sentence}");
+        }
         text
     }
 
@@ -60,7 +66,9 @@ impl BenchResults {
 impl SeriesGroup {
     /// Returns the heads of the table of its series.
     pub(crate) fn heads(&self) -> Vec<String> {
-        let heads = [&["side", "answered of sent"][..], &STATISTICS].concat();
+        let has_reception = self.series.iter().any(|series| series.reception.is_some());
+        let count = if has_reception { "answered of sent" } else { "values" };
+        let heads = [&["side", count][..], &STATISTICS].concat();
         heads.into_iter().map(str::to_owned).chain(self.details()).collect()
     }
 

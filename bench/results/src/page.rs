@@ -37,7 +37,9 @@ impl BenchResults {
                 .collect::<Vec<_>>()
                 .join(" · "),
             facts: facts.map(|(name, value)| (name.clone(), value.clone())).collect(),
-            notes: self.notes.clone(),
+            // The page has no markup.
+            notes: self.notes.iter().map(|note| note.replace(['*', '`'], "")).collect(),
+            recommendation: self.recommendation.clone(),
             sections: groups.chain(growths).chain(figures).collect(),
         }
         .to_html()
@@ -78,6 +80,7 @@ impl SeriesGroup {
                 .map(|series| PlotCurve { name: series.name.clone(), points: ecdf(series) })
                 .collect(),
         };
+        let is_single = self.series.iter().all(|series| series.values.len() < 2);
         let rows = self.series.iter().map(|series| self.row(series)).collect();
         let mut tables = vec![PlotTable { heads: self.heads(), rows }];
         let compared = self.compared();
@@ -90,7 +93,8 @@ impl SeriesGroup {
         MeasurementSection {
             title: self.name.clone(),
             note: format!("in {}", self.unit),
-            plots: vec![plot],
+            // A single value has no distribution.
+            plots: if is_single { Vec::new() } else { vec![plot] },
             tables,
         }
     }
@@ -119,6 +123,18 @@ fn ecdf(series: &Series) -> Vec<[f64; 2]> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_single_value_has_a_row_and_no_plot() {
+        let series = Series { name: "wasm".to_owned(), values: vec![1.0], ..Series::default() };
+        let mut group = SeriesGroup { series: vec![series], ..SeriesGroup::default() };
+        let section = group.section();
+        assert!(section.plots.is_empty());
+        assert_eq!(section.tables[0].heads[..2], ["side", "values"]);
+        assert_eq!(section.tables[0].rows[0][..3], ["wasm", "1", "1.00"]);
+        group.series[0].values.push(2.0);
+        assert_eq!(group.section().plots.len(), 1);
+    }
 
     #[test]
     fn a_distribution_begins_and_ends_with_the_extremes() {

@@ -32,6 +32,9 @@ pub struct BenchResults {
     pub growths: Vec<Growth>,
     /// Sentences that a reader needs to understand the tables.
     pub notes: Vec<String>,
+    /// Sentences that follow from the numbers, for a reader who has to decide.
+    #[serde(default)]
+    pub recommendation: Vec<String>,
 }
 
 /// Series under the same conditions.
@@ -83,6 +86,7 @@ impl BenchResults {
             groups: Vec::new(),
             growths: Vec::new(),
             notes: Vec::new(),
+            recommendation: Vec::new(),
         }
     }
 
@@ -180,7 +184,7 @@ impl BenchResults {
                      with a third argument, the name of a benchmark",
             )
         };
-        let text = fs::read(&path).map_err(|error| failed(&error))?;
+        let text = fs::read(path).map_err(|error| failed(&error))?;
         let results: Self = serde_json::from_slice(&text).map_err(|error| failed(&error))?;
         if results.format != FORMAT {
             let message = format!(
@@ -225,6 +229,7 @@ pub(crate) mod tests {
             series: vec![series("bare", 1.0), series("wasm", 1.5 + shift)],
         });
         results.notes.push("A note.".to_owned());
+        results.recommendation.push("Take one.".to_owned());
         results
     }
 
@@ -263,6 +268,7 @@ pub(crate) mod tests {
         let text = fs::read_to_string(path.join("results.md")).unwrap();
         assert!(text.contains("| bare | 200 of 201 | 1.00 |"), "{text}");
         assert!(text.contains("| wasm | 1.33"), "{text}");
+        assert!(text.ends_with("- A note.\n\n## Recommendation\n\n- Take one.\n"), "{text}");
     }
 
     #[test]

@@ -1,5 +1,5 @@
-//! Measures isolation between lambdas: how much later a lambda answers while another one misbehaves
-//! on another core. Also measures the costs of a process.
+//! Measures isolation: what each way of it costs (`costs`, `start`), and how much later a lambda
+//! answers while another one misbehaves on another core.
 //!
 //! The victim, the player that feeds it and this process share one core. The attacker, with all
 //! that reads its reports, is on another one. All of them run all the time: the attacker reads the
@@ -7,18 +7,21 @@
 
 mod attacker;
 mod blocks;
+mod costs;
 mod start;
 mod victim;
 
+use clap::Args;
+use gleaner_bench_results::{AttackCounts, BenchResults, Figure, Goal, KindValues};
 use gleaner_dds::{Dds, DdsOptions};
 use gleaner_tests::live::play;
 use gleaner_transport::{Clock, LiveSource};
 
 use self::attacker::{ATTACKS, Attacker};
 use self::blocks::BlockSchedule;
+pub use self::costs::{BenchGuest, run_as_runtime};
 use self::victim::Victim;
 use crate::measure::{Twin, bind_to, cores};
-use gleaner_bench_results::Figure;
 
 /// Pairs of blocks for each attack.
 const PAIRS: usize = 20;
@@ -28,27 +31,54 @@ const STARTS: usize = 21;
 const RATE_HZ: f64 = 500.0;
 const RATE: &str = "500";
 
-/// The start of a lambda of each kind.
-pub fn starts(quick: bool) -> Vec<Figure> {
-    let mut figures = Vec::new();
-    start::figures(if quick { 1 } else { STARTS }, &mut figures);
-    figures
+/// The parts of a run.
+#[derive(Args, Clone)]
+pub struct IsolationOptions {
+    /// Measure only the costs of each kind, not the attacks, which take 25 minutes.
+    #[arg(long)]
+    no_attacks: bool,
+    /// Selects the order of the sides in each turn.
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    seed: u64,
 }
 
-/// All figures, or the reason why they cannot be measured.
-pub fn figures(quick: bool) -> Result<Vec<Figure>, String> {
+/// Measures the start of a lambda of each kind; returns its medians in ms.
+pub fn starts(quick: bool, results: &mut BenchResults) -> KindValues {
+    start::figures(if quick { 1 } else { STARTS }, &mut results.figures)
+}
+
+/// Measures everything, and adds what follows from it. Without a second core, nothing is attacked.
+pub fn measure(quick: bool, options: &IsolationOptions, results: &mut BenchResults) {
+    let mut costs = costs::measure(quick, options.seed, results);
+    costs.start_ms = starts(quick, results);
+    if !options.no_attacks {
+        match attacks(quick, &mut results.figures) {
+            // A quick run compares nothing.
+            Ok(counts) => costs.attacks = (counts.compared > 0).then_some(counts),
+            Err(why) => results.notes.push(format!("No attacks were measured: {why}.")),
+        }
+    }
+    results.recommendation = costs.recommendation();
+}
+
+/// Runs all attacks, or returns the reason why they cannot be measured.
+fn attacks(quick: bool, figures: &mut Vec<Figure>) -> Result<AttackCounts, String> {
     let cores = cores().map_err(|error| format!("cannot determine the allowed cores: {error}"))?;
     let [own, attacker, ..] = cores[..] else {
         return Err("victim and attacker need one core each".to_owned());
     };
-    let mut figures = starts(quick);
     bind_to(own).map_err(|error| format!("cannot bind to one core: {error}"))?;
-    attacks(quick, attacker, &mut figures);
-    Ok(figures)
+    let before = figures.len();
+    on_victims(quick, attacker, figures);
+    let compared = figures[before..]
+        .iter()
+        .filter(|figure| figure.unit == "us" && matches!(figure.goal, Some(Goal::AtMost(_))));
+    let unseen = compared.clone().filter(|figure| figure.is_met()).count();
+    Ok(AttackCounts { compared: compared.count(), unseen })
 }
 
 /// Runs all attacks on a victim of each kind, with the attacker on `core`.
-fn attacks(quick: bool, core: usize, figures: &mut Vec<Figure>) {
+fn on_victims(quick: bool, core: usize, figures: &mut Vec<Figure>) {
     let clock = Clock::from_time_of_day();
     let mut victims = [Twin::Rust, Twin::Python].map(Victim::start);
     let readers = victims.len().to_string();

@@ -1,23 +1,15 @@
 //! Runs the bench lambda on a bare wasmtime engine, without the host.
 
-use gleaner_compile::Nans;
 use gleaner_tests::root;
+use wasmtime::Store;
 use wasmtime::component::types::ComponentItem;
 use wasmtime::component::{Component, Func, Linker, ResourceTable, ResourceType, Val};
-use wasmtime::{Engine, Store};
 use wasmtime_wasi::{WasiCtx, WasiCtxView, WasiView};
+
+use super::checks::EngineChecks;
 
 /// Fuel and epochs that never run out.
 const PLENTY: u64 = u64::MAX / 2;
-
-/// EngineChecks that the compiler adds to the code.
-#[derive(Clone, Copy)]
-pub struct EngineChecks {
-    pub fuel: bool,
-    pub epochs: bool,
-    /// Canonicalises NaNs.
-    pub nans: bool,
-}
 
 /// The component, compiled with some checks.
 pub struct BareComponent {
@@ -25,18 +17,12 @@ pub struct BareComponent {
     checks: EngineChecks,
 }
 
-/// Compiles the component.
-pub fn compile(checks: EngineChecks) -> BareComponent {
-    let mut config = gleaner_compile::settings(Nans::Native);
-    config
-        .consume_fuel(checks.fuel)
-        .epoch_interruption(checks.epochs)
-        .cranelift_nan_canonicalization(checks.nans);
-    let engine = Engine::new(&config).expect("an engine");
-    let path = root().join("bench/lambdas/kernels/rust/build/bench_kernels.wasm");
-    let component =
-        Component::from_file(&engine, path).expect("a component; run: cargo xtask bench");
-    BareComponent { component, checks }
+impl BareComponent {
+    /// Compiles the component.
+    pub fn compile(checks: EngineChecks) -> Self {
+        let path = root().join("bench/lambdas/kernels/rust/build/bench_kernels.wasm");
+        Self { component: checks.compile(&path), checks }
+    }
 }
 
 /// An instance that does one kind of work.

@@ -1,21 +1,18 @@
 //! Measures arithmetic in lambdas: kernels of the SDK in a component against the same source
 //! natively, with registers of the same width, and the overhead of fuel, epochs and canonical NaNs.
-//! Also measures calls between lambda and host.
 //!
 //! In each round every kernel runs natively and on every engine, one after the other; ratios are
 //! computed within the round.
 
 mod bare;
-mod hosted;
-
-use std::hint::black_box;
+mod checks;
 
 use bench_kernels::Work;
-use rustix::time::{ClockId, clock_gettime};
 
-use bare::{BareInstance, EngineChecks};
+use crate::measure::timed;
+use bare::{BareComponent, BareInstance};
+pub use checks::EngineChecks;
 use gleaner_bench_results::Figure;
-use hosted::HostedKernel;
 
 /// Kernels, with the goal for the ratio of component to native time.
 const KERNELS: [(&str, Option<f64>); 9] = [
@@ -30,14 +27,15 @@ const KERNELS: [(&str, Option<f64>); 9] = [
     ("mean", None),
 ];
 
-/// Engine settings. Overheads are relative to `NONE`; that of NaNs is relative to `DEFAULT`, the
+/// Engine settings. Overheads are relative to the first; that of NaNs is relative to the fourth, the
 /// settings of the runtime.
-const NONE: EngineChecks = EngineChecks { fuel: false, epochs: false, nans: false };
-const FUEL: EngineChecks = EngineChecks { fuel: true, ..NONE };
-const EPOCHS: EngineChecks = EngineChecks { epochs: true, ..NONE };
-const DEFAULT: EngineChecks = EngineChecks { fuel: true, epochs: true, nans: false };
-const NANS: EngineChecks = EngineChecks { nans: true, ..DEFAULT };
-const ENGINES: [EngineChecks; 5] = [NONE, FUEL, EPOCHS, DEFAULT, NANS];
+const ENGINES: [EngineChecks; 5] = [
+    EngineChecks::NONE,
+    EngineChecks::FUEL,
+    EngineChecks::EPOCHS,
+    EngineChecks::DEFAULT,
+    EngineChecks::NANS,
+];
 
 /// Approximate duration of one measurement in seconds.
 const MEASURED_S: f64 = 0.005;
@@ -46,7 +44,7 @@ const MEASURED_S: f64 = 0.005;
 pub fn figures(quick: bool) -> Vec<Figure> {
     let rounds = if quick { 1 } else { 31 };
     let mut figures = Vec::new();
-    let components = ENGINES.map(bare::compile);
+    let components = ENGINES.map(BareComponent::compile);
     for (kernel, goal) in KERNELS {
         let guests = components
             .iter()
@@ -54,7 +52,6 @@ pub fn figures(quick: bool) -> Vec<Figure> {
             .collect::<Vec<_>>();
         figures.extend(compare(kernel, goal, guests, rounds));
     }
-    figures.extend(host_calls(rounds));
     figures
 }
 
@@ -102,65 +99,6 @@ fn compare(
         figure("overhead of both", "%", &overhead(default, none)),
         figure("additional overhead of canonical NaNs", "%", &overhead(nans, default)),
     ]
-}
-
-/// Measures calls between lambda and host, as in a replay.
-fn host_calls(rounds: usize) -> Vec<Figure> {
-    let (mut empty, mut call) = (HostedKernel::new("copy", 0), HostedKernel::new("call", 100_000));
-    let (mut stream, mut copy) = (HostedKernel::new("stream", 4), HostedKernel::new("copy", 4));
-    let source = vec![7_u8; hosted::FRAME_BYTES];
-    let mut target = vec![0_u8; hosted::FRAME_BYTES];
-    let mut series: [Vec<f64>; 7] = Default::default();
-    for _ in 0..rounds {
-        let tick_ns = 1000.0 * timed(2000, || (0..2000).for_each(|_| empty.tick())).0;
-        let call_ns = 1000.0 * timed(call.rounds(), || call.frame()).0;
-        let stream_us = timed(stream.rounds(), || stream.frame()).0;
-        let copy_us = timed(copy.rounds(), || copy.frame()).0;
-        let copied = || {
-            (0..copy.rounds())
-                .for_each(|_| black_box(&mut target).copy_from_slice(black_box(&source)))
-        };
-        let memcpy_us = timed(copy.rounds(), copied).0;
-        let row = [
-            tick_ns,
-            call_ns,
-            stream_us,
-            copy_us,
-            memcpy_us,
-            stream_us / memcpy_us,
-            copy_us / memcpy_us,
-        ];
-        series.iter_mut().zip(row).for_each(|(series, value)| series.push(value));
-    }
-    vec![
-        Figure::without_goal("wake of an empty lambda", "ns", &series[0]),
-        Figure::without_goal("host call `now-ns`", "ns", &series[1]),
-        Figure::without_goal(
-            "1920x1080 bgr8 (6.2 MB) read by a lambda in pieces of 64 KiB",
-            "us",
-            &series[2],
-        ),
-        Figure::without_goal("the same, pieces copied into a whole frame", "us", &series[3]),
-        Figure::without_goal("the same by memcpy", "us", &series[4]),
-        Figure::at_most("1920x1080 bgr8 read in pieces, against memcpy", "times", 1.1, &series[5]),
-        Figure::without_goal(
-            "1920x1080 bgr8 read in pieces into a whole frame, against memcpy",
-            "times",
-            &series[6],
-        ),
-    ]
-}
-
-/// Microseconds for each of the `times` repetitions of `work`, and its result. Measured in CPU time
-/// of this thread: other work on the core matters only by its effect on the caches.
-fn timed<T>(times: u64, work: impl FnOnce() -> T) -> (f64, T) {
-    let now_us = || {
-        let now = clock_gettime(ClockId::ThreadCPUTime);
-        now.tv_sec as f64 * 1e6 + now.tv_nsec as f64 / 1e3
-    };
-    let started_us = now_us();
-    let result = work();
-    ((now_us() - started_us) / times as f64, result)
 }
 
 /// Repetitions of `work` that take about [`MEASURED_S`].

@@ -57,7 +57,6 @@ struct Costs {
 
 #[derive(Clone, Copy)]
 struct Process {
-    pid: u32,
     cpu_ns: u64,
     own_mb: f64,
 }
@@ -204,18 +203,32 @@ impl Load<'_> {
 impl Costs {
     /// The costs so far of the processes of a run.
     fn of(started: &RunningProgram) -> Self {
-        let (mut ingress, mut lambdas) = (None, Vec::new());
+        let LiveProcesses { ingress, lambdas, .. } = LiveProcesses::of(started);
+        let ingress = ingress.map(Process::of).expect("a run has an ingress");
+        Self { ingress, lambdas: lambdas.into_iter().map(Process::of).collect() }
+    }
+}
+
+/// The processes of a run.
+pub(crate) struct LiveProcesses {
+    ingress: Option<u32>,
+    pub(crate) shims: Vec<u32>,
+    /// Those that run lambdas, in the same order each time.
+    pub(crate) lambdas: Vec<u32>,
+}
+
+impl LiveProcesses {
+    pub(crate) fn of(started: &RunningProgram) -> Self {
+        let mut found = Self { ingress: None, shims: Vec::new(), lambdas: Vec::new() };
         for pid in descendants(started.pid(), "") {
-            let name = read(pid, "comm");
-            match name.trim() {
-                "gleaner-shim" => {}
-                "gleaner-ingress" => ingress = Some(Process::of(pid)),
-                _ => lambdas.push(Process::of(pid)),
+            match read(pid, "comm").trim() {
+                "gleaner-shim" => found.shims.push(pid),
+                "gleaner-ingress" => found.ingress = Some(pid),
+                _ => found.lambdas.push(pid),
             }
         }
-        // In the same order each time.
-        lambdas.sort_by_key(|process| process.pid);
-        Self { ingress: ingress.expect("a run has an ingress"), lambdas }
+        found.lambdas.sort_unstable();
+        found
     }
 }
 
@@ -228,7 +241,7 @@ impl Process {
             name.starts_with("Private_").then_some(kib)
         });
         let own_mb = private.sum::<f64>() * 1024.0 / 1e6;
-        Self { pid, cpu_ns: cpu_ns(pid), own_mb }
+        Self { cpu_ns: cpu_ns(pid), own_mb }
     }
 
     /// The share of a core that it took until `later`, `span` after this look, in %.

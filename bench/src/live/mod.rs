@@ -21,6 +21,7 @@ use signal_hook::consts::{SIGINT, SIGTERM};
 
 use crate::measure::Twin;
 pub use busy_cores::BusyCores;
+pub(crate) use load::LiveProcesses;
 pub use scale::loads;
 
 /// Environment variable of the process in the private network: the process that started it.

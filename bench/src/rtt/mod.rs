@@ -23,9 +23,10 @@ use gleaner_dds::{Dds, DdsOptions};
 
 use crate::answers::RttReceiver;
 use crate::live::BusyCores;
+use crate::measure::shuffled;
 use buffers::BufferLimit;
 use sides::{Side, Turn};
-use workload::Workload;
+pub(crate) use workload::Workload;
 
 /// Topic of all answers.
 const ANSWERS: &str = "/rtt/answers";
@@ -114,15 +115,7 @@ fn compare(
     let meter = PowerMeter::of_this_machine();
     let mut memory = Vec::new();
     for _ in 0..options.turns {
-        let mut order: Vec<usize> = (0..sides.len()).collect();
-        // Fisher and Yates.
-        for last in (1..order.len()).rev() {
-            random ^= random << 13;
-            random ^= random >> 7;
-            random ^= random << 17;
-            order.swap(last, (random % (last as u64 + 1)) as usize);
-        }
-        for index in order {
+        for index in shuffled(sides.len(), &mut random) {
             let seconds = [options.warm_up, options.turn];
             match sides[index].turn(workload, &answers, &meter, seconds) {
                 Ok(turn) => turns.entry(index).or_default().push(turn),

@@ -12,7 +12,7 @@ const BUFFERS: [u64; 3] = [212_992, 4 << 20, 64 << 20];
 
 /// A workload.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub(super) enum Workload {
+pub(crate) enum Workload {
     /// An IMU at 100 Hz; nothing is computed.
     Empty,
     /// The same with cores that do not sleep.
@@ -103,7 +103,7 @@ impl Workload {
 
     /// Returns a copy of the lambda, on the topics of the player. It looks at each image: at rest,
     /// too, a car brakes by less than 100 m/s^2.
-    fn lambda(self, kind: Twin) -> LambdaCopy {
+    pub(crate) fn lambda(self, kind: Twin) -> LambdaCopy {
         let folder = match self {
             Self::Empty | Self::EmptyAwake => "bench/lambdas/imu",
             Self::ImuFft => "examples/imu-fft",

@@ -31,7 +31,7 @@ const WAKES_PER_TIDY: u64 = 10;
 pub(crate) fn main(py: Python<'_>, args: Vec<OsString>, host: Py<PyAny>) -> u8 {
     // Attached only during a call into the lambda, so that its own threads run between wakes.
     py.detach(|| {
-        program::run_in_python(args, &mut |lambda, manifest, session, mode| {
+        program::run_with(args, &mut |lambda, manifest, session, mode| {
             let host = Python::attach(|py| host.clone_ref(py));
             let entry = lambda.build.entry_path(manifest);
             let allowed = CallLimits::new(&manifest.limits, mode);

@@ -72,8 +72,9 @@ function main() {
   followSystem();
   document.title = page.title;
   document.getElementById("head").append(make("div", { class: "name" }, make("h1", { text: page.title }), make("span", { class: "grow" }), themeButton()), make("p", { class: "origin", text: page.origin }));
-  const notes = page.notes.length > 0 ? card("Notes", null, make("ul", {}, page.notes.map((text) => make("li", { text })))) : null;
-  document.getElementById("page").append(...[...page.sections.map(sectionCard), notes, card("Machine", null, terms(page.facts))].filter(Boolean));
+  const list = (title, texts) => (texts.length > 0 ? card(title, null, make("ul", {}, texts.map((text) => make("li", { text })))) : null);
+  const after = [list("Notes", page.notes), card("Machine", null, terms(page.facts)), list("Recommendation", page.recommendation)];
+  document.getElementById("page").append(...[...page.sections.map(sectionCard), ...after].filter(Boolean));
   document.getElementById("foot").textContent = "This page is self-contained and loads nothing.";
 }
 

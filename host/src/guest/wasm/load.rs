@@ -97,6 +97,7 @@ pub struct Loaded {
     lambda: LambdaPre<Hosted>,
     seed: [u8; 32],
     nans: Nans,
+    counts_fuel: bool,
 }
 
 impl Loaded {
@@ -123,7 +124,27 @@ impl Loaded {
             WasmError::Load { path: entry.path().to_owned(), source: source.into() }
         })?;
         let lambda = Self::check(path, &engine, &code)?;
-        Ok(Self { engine, lambda, seed: Sha256::digest(&component).into(), nans })
+        let seed = Sha256::digest(&component).into();
+        Ok(Self { engine, lambda, seed, nans, counts_fuel: true })
+    }
+
+    /// Takes the component at `path`, which a bench has compiled as `code` with other checks than
+    /// [`gleaner_compile::settings`] has, to measure their cost. Without fuel, nothing but a
+    /// deadline ends its code.
+    ///
+    /// # Errors
+    ///
+    /// As [`Loaded::open`].
+    pub fn with_checks(
+        path: &Path,
+        code: &Component,
+        counts_fuel: bool,
+    ) -> Result<Self, WasmError> {
+        let component = read_component(path)?;
+        let engine = code.engine().clone();
+        let lambda = Self::check(path, &engine, code)?;
+        let seed = Sha256::digest(&component).into();
+        Ok(Self { engine, lambda, seed, nans: Nans::Native, counts_fuel })
     }
 
     fn check(
@@ -151,6 +172,11 @@ impl Loaded {
     /// Wasmtime's version, and the settings of the compiler.
     pub(super) fn settings(&self) -> &'static str {
         self.nans.settings()
+    }
+
+    /// Returns whether its engine counts fuel: always, except in a bench.
+    pub(super) fn counts_fuel(&self) -> bool {
+        self.counts_fuel
     }
 
     pub(super) fn seed(&self) -> [u8; 32] {

@@ -61,6 +61,7 @@ struct Hosted {
     output: GuestOutput,
     allowed: Limits,
     caps: Caps,
+    counts_fuel: bool,
     /// Due time of the current call, if there is a deadline.
     due: Option<Instant>,
 }
@@ -111,6 +112,7 @@ impl WasmGuest {
             output,
             allowed: self.limits,
             caps: Caps::new(&self.limits, self.session.fuel().clone()),
+            counts_fuel: self.loaded.counts_fuel(),
             due: None,
         };
         let mut store = Store::new(self.loaded.engine(), hosted);
@@ -199,7 +201,9 @@ impl<'a> GuestCall<'a> {
         fuel: u64,
         deadline: Option<(&'a Deadline, Duration)>,
     ) -> Self {
-        store.set_fuel(fuel).expect("the engine counts fuel");
+        if store.data().counts_fuel {
+            store.set_fuel(fuel).expect("the engine counts fuel");
+        }
         let hosted = store.data_mut();
         hosted.session.fuel().begin(fuel);
         hosted.caps.forget_refusal();
@@ -233,7 +237,10 @@ impl<'a> GuestCall<'a> {
         let taken = self.armed.as_ref().map(deadline::ArmedCall::taken);
         drop(self.armed);
         self.store.data().output.end();
-        let left = self.store.get_fuel().unwrap_or(0);
+        let left = match self.store.data().counts_fuel {
+            true => self.store.get_fuel().unwrap_or(0),
+            false => self.fuel,
+        };
         let used = (self.fuel - left.min(self.fuel))
             .saturating_add(self.store.data().session.fuel().used());
         let time = taken.map(deadline::CallTime::elapsed_and_allowed);

@@ -6,13 +6,18 @@ use std::hint::black_box;
 use gleaner_sdk::data::Encoding;
 use gleaner_sdk::kernels::fft::{Real, Spectrum};
 use gleaner_sdk::kernels::{Image, downscale, histogram, luma, mean};
-use gleaner_sdk::{Config, Error, Lambda, Result, Sample, Tick, now_ns};
+use gleaner_sdk::{
+    Config, Error, Field, Frame, Lambda, Result, Sample, Tick, Topic, input, now_ns,
+};
 
 const WIDTH: u32 = 1920;
 const HEIGHT: u32 = 1080;
 
 /// Bytes of a piece of a frame.
 const PIECE: u32 = 64 << 10;
+
+/// Samples of a column.
+const COLUMN: u32 = 256;
 
 /// One kernel with its input and the buffer for its output.
 pub enum Work {
@@ -127,46 +132,90 @@ fn noise(count: usize) -> Vec<u8> {
 }
 
 struct Kernels {
-    name: String,
+    work: Requested,
     rounds: i64,
-    /// `None` for work that needs a host.
-    work: Option<Work>,
     pixels: Vec<u8>,
+}
+
+/// The work of a lambda.
+enum Requested {
+    /// Work without a host, in a tick.
+    Alone(Work),
+    /// Work with the host, in a wake by a frame.
+    Hosted(HostWork),
+}
+
+/// Work with a host.
+enum HostWork {
+    /// Makes the smallest host call.
+    Call,
+    /// Reads a field of the newest samples.
+    Column(Topic, Field),
+    /// Has the host compute the mean luma.
+    Luma,
+    /// Reads all pixels in pieces, without storing them.
+    Stream,
+    /// Copies all pixels into one buffer.
+    Copy,
+    /// Does that, and computes their mean luma.
+    CopyLuma,
+}
+
+impl HostWork {
+    fn new(name: &str) -> Result<Option<Self>> {
+        Ok(Some(match name {
+            "call" => Self::Call,
+            "column" => {
+                let imu = input("imu")?;
+                let field = imu.field("linear_acceleration.x")?;
+                Self::Column(imu, field)
+            }
+            "luma-by-host" => Self::Luma,
+            "stream" => Self::Stream,
+            "copy" => Self::Copy,
+            "copy-luma" => Self::CopyLuma,
+            _ => return Ok(None),
+        }))
+    }
 }
 
 impl Lambda for Kernels {
     fn init(config: &Config) -> Result<Self> {
-        let name = config.text("work")?.to_owned();
-        let work = if ["copy", "stream", "call"].contains(&name.as_str()) {
-            None
-        } else {
-            Some(Work::new(&name)?)
+        let name = config.text("work")?;
+        let work = match HostWork::new(name)? {
+            Some(work) => Requested::Hosted(work),
+            None => Requested::Alone(Work::new(name)?),
         };
-        Ok(Self { name, rounds: config.integer("rounds")?, work, pixels: Vec::new() })
+        Ok(Self { work, rounds: config.integer("rounds")?, pixels: Vec::new() })
     }
 
-    /// Does work with the host, which has a frame: reads all pixels in pieces, with or without
-    /// storing them, or makes the smallest host call.
     fn on_event(&mut self, sample: Sample) -> Result<()> {
-        if self.name == "call" {
-            for _ in 0..self.rounds {
-                black_box(now_ns());
-            }
-            return Ok(());
-        }
+        let Requested::Hosted(work) = &self.work else {
+            return Err(Error::new("this work needs no host"));
+        };
         let frame = sample.as_frame()?;
-        let size = frame.info().size;
-        if self.name == "stream" {
-            for _ in 0..self.rounds {
-                (0..size)
-                    .step_by(PIECE as usize)
-                    .for_each(|offset| drop(black_box(frame.read(offset, PIECE))));
-            }
-            return Ok(());
-        }
-        self.pixels.resize(size as usize, 0);
+        let info = frame.info();
+        let pixels = &mut self.pixels;
         for _ in 0..self.rounds {
-            frame.copy_to(black_box(&mut self.pixels))?;
+            match work {
+                HostWork::Call => {
+                    black_box(now_ns());
+                }
+                HostWork::Column(imu, field) => drop(black_box(imu.column(field, COLUMN)?)),
+                HostWork::Luma => {
+                    black_box(frame.mean_luma(None)?);
+                }
+                HostWork::Stream => (0..info.size)
+                    .step_by(PIECE as usize)
+                    .for_each(|offset| drop(black_box(frame.read(offset, PIECE)))),
+                HostWork::Copy => copy(&frame, pixels)?,
+                HostWork::CopyLuma => {
+                    copy(&frame, pixels)?;
+                    let step = info.width * 3;
+                    let image = Image::new(info.width, info.height, step, info.encoding, pixels)?;
+                    black_box(luma::mean_luma(&image));
+                }
+            }
         }
         Ok(())
     }
@@ -177,9 +226,16 @@ impl Lambda for Kernels {
         if tick.missed == 0 {
             return Ok(());
         }
-        let work = self.work.as_mut().ok_or_else(|| Error::new("this work needs a host"))?;
+        let Requested::Alone(work) = &mut self.work else {
+            return Err(Error::new("this work needs a host"));
+        };
         Err(Error::new(work.rounds(tick.missed)?.to_string()))
     }
+}
+
+fn copy(frame: &Frame, pixels: &mut Vec<u8>) -> Result<()> {
+    pixels.resize(frame.info().size as usize, 0);
+    frame.copy_to(black_box(pixels))
 }
 
 gleaner_sdk::lambda!(Kernels);
