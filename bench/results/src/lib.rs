@@ -5,6 +5,7 @@
 //!   and as a page with plots.
 //! - [`Summary`] has the statistics of a series, and [`MeasuredDifference`] compares two.
 //! - [`Comparison`] compares two runs.
+//! - [`SequenceEntry`] is one of several benchmarks that ran one after the other.
 //! - [`Machine`] is where a run took place.
 
 mod comparison;
@@ -14,6 +15,7 @@ mod machine;
 mod markdown;
 mod page;
 mod results;
+mod sequence;
 mod statistics;
 #[cfg(test)]
 #[path = "../../../base/src/test_folder.rs"]
@@ -24,4 +26,5 @@ pub use figure::{Figure, Goal};
 pub use growth::{Growth, GrowthCurve};
 pub use machine::Machine;
 pub use results::{BenchResults, Reception, Series, SeriesGroup};
+pub use sequence::{BenchEnd, OUTPUT, SequenceEntry};
 pub use statistics::{MeasuredDifference, Summary, quantile};
