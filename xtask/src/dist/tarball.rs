@@ -1,4 +1,4 @@
-//! The tarball: a folder that runs where it is unpacked, with the programs of the packages, those of
+//! The tarball: a folder that runs where it is unpacked, with the programs of the packages and of
 //! the bench, and the built lambdas and scripts that the bench needs.
 
 use std::ffi::OsStr;
@@ -83,7 +83,7 @@ fn place_folder(checkout: &Checkout, tree: &PackageTree, folder: &Path) -> Resul
 }
 
 /// Packs the folder `name` in `root` into `file`. The same files become the same bytes: they are
-/// sorted, of `time`, and of nobody in particular.
+/// sorted, of `time`, and have no names of owners.
 fn pack(
     checkout: &Checkout,
     root: &Path,
