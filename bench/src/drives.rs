@@ -5,28 +5,32 @@ use std::process::Command;
 use std::time::Instant;
 
 use gleaner_protocol::{DriveInfo, ReplaySummary};
-use gleaner_tests::{TempFolder, bag, program, replay, root, sample_drive};
+use gleaner_tests::{TempFolder, bag, program, python_home, replay, root, sample_drive};
 
-use gleaner_bench_results::Figure;
+use crate::measure::python;
+use gleaner_bench_results::{BenchResults, Figure};
 
 /// Copies of the sample drive that make 2 GB.
 const ROUNDS: u64 = 265;
 
 /// Measures a drive of 2 GB in each storage; a tenth of that if `quick`.
-pub fn figures(quick: bool) -> Vec<Figure> {
+pub fn measure(quick: bool, results: &mut BenchResults) {
     let rounds = if quick { ROUNDS / 10 } else { ROUNDS };
     let folder = TempFolder::new();
     let mcap = folder.path().join("drive.mcap");
     bag::mcap(&mcap, rounds);
     let directory = bag::directory(&folder, rounds);
     let short = hello(&sample_drive(), "rust").peak_rss_bytes;
-    let mut figures = against_rosbags(quick);
+    match rosbags_unavailable() {
+        None => results.figures = against_rosbags(quick),
+        Some(why) => results.notes.push(format!("the script on rosbags is skipped: {why}")),
+    }
     for (name, drive, file) in
         [("MCAP", &mcap, &mcap), ("sqlite3", &directory, &directory.join("drive_0.db3"))]
     {
         let bytes = std::fs::metadata(file).expect("it was written").len();
         let mut add = |what: &str, unit, value: f64| {
-            figures.push(Figure::without_goal(&format!("{name}: {what}"), unit, &[value]))
+            results.figures.push(Figure::without_goal(&format!("{name}: {what}"), unit, &[value]))
         };
         add("size", "GB", bytes as f64 / 1e9);
         let summary = hello(drive, "rust");
@@ -35,11 +39,24 @@ pub fn figures(quick: bool) -> Vec<Figure> {
         add("replay by hello", "wakes/s", summary.wakes_per_s);
         let growth = summary.peak_rss_bytes as f64 - short as f64;
         let what = format!("{name}: additional memory against a replay of the sample drive");
-        figures.push(Figure::at_most(&what, "MiB", 16.0, &[growth / 1024.0 / 1024.0]));
+        results.figures.push(Figure::at_most(&what, "MiB", 16.0, &[growth / 1024.0 / 1024.0]));
         let opened: Vec<_> = (0..if quick { 2 } else { 9 }).map(|_| inspect_ms(drive)).collect();
-        figures.push(Figure::at_most(&format!("{name}: gleaner inspect"), "ms", 1000.0, &opened));
+        let what = format!("{name}: gleaner inspect");
+        results.figures.push(Figure::at_most(&what, "ms", 1000.0, &opened));
     }
-    figures
+}
+
+/// The reason why the script on rosbags cannot run; `None` if it can.
+fn rosbags_unavailable() -> Option<String> {
+    let output = Command::new(python()).args(["-I", "-c", "import rosbags"]).output();
+    match output {
+        Ok(output) if output.status.success() => None,
+        Ok(output) => {
+            let text = String::from_utf8_lossy(&output.stderr);
+            Some(text.lines().last().unwrap_or("rosbags cannot be imported").to_owned())
+        }
+        Err(error) => Some(format!("cannot start `{}`: {error}", python().display())),
+    }
 }
 
 /// Runs the same function over a drive of 200 MB in lambdas and in a script on rosbags,
@@ -76,8 +93,8 @@ fn against_rosbags(quick: bool) -> Vec<Figure> {
 
 /// Messages, triggers and seconds of the script.
 fn rosbags(drive: &Path) -> (u64, u64, f64) {
-    let output = Command::new(root().join(".venv/bin/python3"))
-        .env("PYTHONPATH", root().join("guest-sdk-python"))
+    let output = Command::new(python())
+        .env("PYTHONPATH", python_home())
         .arg(root().join("bench/rosbags_loop.py"))
         .args([drive, &root().join("examples/hello/python")])
         .arg(BRAKE_MPS2)

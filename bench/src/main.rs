@@ -3,6 +3,7 @@
 //! Variants alternate, so that drift of the machine affects all of them alike. Each benchmark
 //! writes its results as JSON, as Markdown, and as a page with plots.
 
+mod all;
 mod answers;
 mod drives;
 mod inference;
@@ -39,6 +40,12 @@ struct Args {
 
 #[derive(Subcommand, Clone)]
 enum BenchCommand {
+    /// All benchmarks of a vehicle, one after the other; the results become one file.
+    All {
+        /// A benchmark to leave out; may be repeated.
+        #[arg(long, value_name = "NAME")]
+        skip: Vec<String>,
+    },
     /// Round trips from a sample to its answer, against a bare reader and programs without
     /// Gleaner; needs gleaner-player.
     Rtt {
@@ -99,6 +106,7 @@ fn main() -> ExitCode {
             return isolation::run_as_runtime(*guest, arguments.clone());
         }
         BenchCommand::Compare { a, b } => compare(a, b),
+        BenchCommand::All { skip } => all::run(args.quick, skip, args.out.as_deref()),
         command => measure(command, &args),
     };
     done.unwrap_or_else(|failure| {
@@ -134,10 +142,13 @@ fn measure(command: &BenchCommand, args: &Args) -> Result<ExitCode, Failure> {
         BenchCommand::ColdStart => drop(isolation::starts(quick, &mut results)),
         BenchCommand::Replay => results.figures = replay::figures(quick),
         BenchCommand::Record => results.figures = record::figures(quick),
-        BenchCommand::Drives => results.figures = drives::figures(quick),
+        BenchCommand::Drives => drives::measure(quick, &mut results),
         BenchCommand::Kernels => results.figures = kernels::figures(quick),
         BenchCommand::Inference => inference::measure(quick, &mut results),
-        BenchCommand::Guest { .. } | BenchCommand::Model { .. } | BenchCommand::Compare { .. } => {}
+        BenchCommand::All { .. }
+        | BenchCommand::Guest { .. }
+        | BenchCommand::Model { .. }
+        | BenchCommand::Compare { .. } => {}
     }
     results.machine.add_load("load after");
     let folder = args.out.clone().unwrap_or_else(|| root().join("target/bench").join(name));
@@ -151,6 +162,7 @@ impl BenchCommand {
     /// The name of its results.
     fn name(&self) -> &'static str {
         match self {
+            Self::All { .. } => "all",
             Self::Rtt { .. } => "rtt",
             Self::Scale => "scale",
             Self::Isolation { .. } => "isolation",
@@ -181,12 +193,16 @@ impl BenchCommand {
 fn add_versions(results: &mut BenchResults) {
     let machine = &mut results.machine;
     machine.add_version("measured", Command::new("date").args(["-u", "+%Y-%m-%d %H:%M UTC"]));
-    let mut git = Command::new("git");
-    git.args(["describe", "--always", "--dirty", "--abbrev=12"]).current_dir(root());
-    machine.add_version("revision", &mut git);
+    // A tarball states it in a file, and may be unpacked in a checkout of something else.
+    let mut revision = Command::new("cat");
+    revision.arg(root().join("REVISION"));
+    if !root().join("REVISION").is_file() {
+        revision = Command::new("git");
+        revision.args(["describe", "--always", "--dirty", "--abbrev=12"]).current_dir(root());
+    }
+    machine.add_version("revision", &mut revision);
     machine.add_version("rustc", Command::new("rustc").arg("--version"));
-    let python = root().join(".venv/bin/python3");
-    machine.add_version("python", Command::new(python).arg("--version"));
+    machine.add_version("python", Command::new(measure::python()).arg("--version"));
 }
 
 fn compare(a: &Path, b: &Path) -> Result<ExitCode, Failure> {

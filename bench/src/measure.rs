@@ -68,6 +68,17 @@ pub fn shuffled(count: usize, random: &mut u64) -> Vec<usize> {
     order
 }
 
+/// The Python of scripts that are compared with: that of `GLEANER_PYTHON`, of the checkout, or of
+/// the system.
+pub fn python() -> PathBuf {
+    let of_checkout = root().join(".venv/bin/python3");
+    match std::env::var_os("GLEANER_PYTHON") {
+        Some(python) => python.into(),
+        None if of_checkout.is_file() => of_checkout,
+        None => "python3".into(),
+    }
+}
+
 /// Binds this process and its children to the first core that it may use.
 pub fn bind_to_one_core() -> std::io::Result<()> {
     bind_to(cores()?.first().copied().unwrap_or(0))

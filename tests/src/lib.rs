@@ -26,9 +26,26 @@ use gleaner_lambda::{Clip, Decision};
 use gleaner_protocol::{ReplaySummary, Report, Verified};
 use gleaner_report::format::{seconds, trigger_lines};
 
-/// The checkout.
+/// The checkout; of `gleaner-bench` in an unpacked tarball, the folder of the tarball, where all
+/// that it reads has the same place.
 pub fn root() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("tests/ lies in the checkout").to_owned()
+    let checkout = Path::new(env!("CARGO_MANIFEST_DIR")).parent();
+    unpacked().unwrap_or_else(|| checkout.expect("tests/ lies in the checkout").to_owned())
+}
+
+/// The folder of the unpacked tarball that this program belongs to, if it does.
+fn unpacked() -> Option<PathBuf> {
+    let exe = std::env::current_exe().ok()?;
+    let root = exe.parent().filter(|folder| folder.ends_with("bin"))?.parent()?;
+    root.join("lib/gleaner").is_dir().then(|| root.to_owned())
+}
+
+/// The folder with `start.py` and the Python package `gleaner`.
+pub fn python_home() -> PathBuf {
+    match unpacked() {
+        Some(root) => root.join("lib/gleaner"),
+        None => root().join("guest-sdk-python"),
+    }
 }
 
 /// The recorded drive that comes with the project.
@@ -42,19 +59,26 @@ pub fn shared_drive(name: &str) -> Result<PathBuf, String> {
     if path.is_file() { Ok(path) } else { Err(format!("no `{name}` in ../shared/data")) }
 }
 
-/// A program of the workspace, built into the same folder as this one.
+/// A program of the workspace: built into the same folder as this one, or of the same tarball.
 ///
 /// # Panics
 ///
 /// If it is not built.
 pub fn program(name: &str) -> PathBuf {
+    find_program(name).unwrap_or_else(|| panic!("{name} is not built; run: cargo xtask test"))
+}
+
+/// As [`program`]; `None` if it is not built.
+pub fn find_program(name: &str) -> Option<PathBuf> {
+    if let Some(root) = unpacked() {
+        let places = ["bin", "lib/gleaner"].map(|folder| root.join(folder).join(name));
+        return places.into_iter().find(|path| path.is_file());
+    }
     let test = std::env::current_exe().expect("a test has a path");
     // target/release/deps/test-0123, or target/release/bench
     let folder = test.parent().expect("a program lies in a folder");
     let folder = if folder.ends_with("deps") { folder.parent().unwrap_or(folder) } else { folder };
-    let path = folder.join(name);
-    assert!(path.is_file(), "{} is not built; run: cargo xtask test", path.display());
-    path
+    Some(folder.join(name)).filter(|path| path.is_file())
 }
 
 /// Number of repetitions of a test: the variable `name`, else `usual`, which is short, or twenty

@@ -13,7 +13,7 @@ use gleaner_protocol::ingress::IngressReport;
 use gleaner_protocol::link::RecorderReport;
 use gleaner_protocol::{LiveStatus, Report};
 
-use crate::{program, root};
+use crate::{find_program, program, root};
 
 /// Maximum wait for anything: far longer than needed, so that only a hang reaches it.
 pub const PATIENCE: Duration = Duration::from_secs(90);
@@ -42,8 +42,7 @@ pub fn no_player() -> Option<&'static str> {
 }
 
 fn player() -> Option<PathBuf> {
-    let player = program("gleaner").with_file_name("gleaner-player");
-    player.is_file().then_some(player)
+    find_program("gleaner-player")
 }
 
 /// Starts `gleaner run` with a built lambda, reporting as JSON.

@@ -34,7 +34,7 @@ fn fleet(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
     let mut steps = Steps::of(2);
     steps.begin("programs (the first time this takes minutes)");
     setup::programs(checkout)?;
-    build(checkout, "gleaner-fleet-bench")?;
+    setup::binary(checkout, "gleaner-fleet-bench")?;
     steps.begin("measurements");
     start(checkout, "gleaner-fleet-bench", arguments)
 }
@@ -44,13 +44,13 @@ fn measure(checkout: &Checkout, name: &str, arguments: &[OsString]) -> Result<Ex
     setup::run(checkout, &mut steps, &checkout.lambdas(&FAMILIES))?;
     steps.begin("programs for comparison");
     venv::set_up_for_tests(checkout)?;
-    if name == "rtt"
+    if ["rtt", "all"].contains(&name)
         && let Err(failure) = venv::apart(checkout, &checkout.target().join("baselines"), &STAND_IN)
     {
         println!("without the stand-in for ROS 2:\n{failure}");
     }
     steps.begin("gleaner-bench");
-    build(checkout, "gleaner-bench")?;
+    setup::binary(checkout, "gleaner-bench")?;
     steps.begin("measurements");
     start(checkout, "gleaner-bench", arguments)
 }
@@ -64,15 +64,8 @@ fn parts(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
 
 /// Compares results that were stored.
 fn compare(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
-    build(checkout, "gleaner-bench")?;
+    setup::binary(checkout, "gleaner-bench")?;
     start(checkout, "gleaner-bench", arguments)
-}
-
-fn build(checkout: &Checkout, program: &str) -> Result<(), Failure> {
-    let mut build = checkout.cargo();
-    // Only the binary is named: cargo selects features by the named packages, and other features
-    // would compile dependencies twice.
-    steps::run(build.args(["build", "--release", "--bin", program]), "see the first error above")
 }
 
 fn start(checkout: &Checkout, program: &str, arguments: &[OsString]) -> Result<Exit, Failure> {

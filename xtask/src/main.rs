@@ -5,15 +5,18 @@
 //! each command has a file. Nothing here is installed.
 
 mod aarch64;
+mod architecture;
 mod bench;
 mod bless;
 mod checkout;
 mod deb;
 mod demo;
+mod dist;
 mod docs;
 mod examples;
 mod fleet;
 mod fuzz;
+mod glibc;
 mod page;
 mod peers;
 mod player;
@@ -42,8 +45,9 @@ const USAGE: &str = "usage: cargo xtask COMMAND
   bless    write the examples' decisions to expected.txt, and the generated files
   docs     fetch mdBook and build the pages as a book in target/book
   bench    run a benchmark: rtt, scale, isolation, cold-start, replay, record, drives, kernels,
-           inference, fleet or parts; `compare A B` compares two results, and `compare BASE HEAD NAME`
-           measures two revisions in turns; see bench/README.md
+           inference, fleet or parts; `all` runs all but fleet and parts, and packs the results into
+           one file; `compare A B` compares two results, and `compare BASE HEAD NAME` measures two
+           revisions in turns; see bench/README.md
   fleet    serve the cloud as three replicas on this machine, until ctrl-C; --install fetches its
            packages first, --kills N kills its programs in turn under simulated vehicles
   peers    build test programs on other DDS implementations; --install fetches their packages first
@@ -52,7 +56,9 @@ const USAGE: &str = "usage: cargo xtask COMMAND
   fuzz     fuzz parsers of untrusted input; [TARGET...] [--seconds N] [--seed N]
   aarch64  build for ARM vehicles, and compare the decisions of lambdas there, emulated
   build    only set up: wasm target, Python environment, programs, lambdas
-  deb      build the Debian packages; [--arch amd64|arm64] [--programs DIR] [--test]";
+  deb      build the Debian packages; [--arch amd64|arm64] [--programs DIR] [--test]
+  dist     build the Debian packages, and a tarball with the bench, for machines without a
+           toolchain; [--target aarch64|x86_64] [--out DIR] [--programs DIR] [--install]";
 
 fn main() -> ExitCode {
     match run(env::args_os().skip(1).collect()) {
@@ -70,7 +76,7 @@ fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
         None => ("", &[][..]),
     };
     let has_arguments =
-        ["bench", "deb", "demo", demo::VEHICLE_COMMAND, "fleet", "fuzz", "page", "peers"];
+        ["bench", "deb", "demo", demo::VEHICLE_COMMAND, "dist", "fleet", "fuzz", "page", "peers"];
     if !rest.is_empty() && !has_arguments.contains(&command) {
         return Err(Failure::new(
             Exit::Usage,
@@ -92,6 +98,7 @@ fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
         "peers" => peers::build(&checkout, rest),
         "player" => player::run(&checkout),
         "deb" => deb::run(&checkout, rest),
+        "dist" => dist::run(&checkout, rest),
         "aarch64" => aarch64::run(&checkout),
         "build" => {
             setup::run(&checkout, &mut Steps::of(setup::STEPS), &checkout.lambdas(&FAMILIES))

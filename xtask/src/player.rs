@@ -15,20 +15,30 @@ use crate::venv;
 
 /// Finds or fetches the tools, and builds.
 pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
-    let mut steps = Steps::of(2);
-    steps.begin("cmake and libclang");
-    let mut build = cargo(checkout)?;
+    let mut steps = Steps::of(1);
     steps.begin("gleaner-player with Cyclone DDS (the first time this takes minutes)");
-    // With the features of the whole workspace, so that shared dependencies are built once.
-    build.args(["build", "--release", "--workspace", "--bin", "gleaner-player"]);
-    let help = "if a C compiler is missing, install one (`cc`); else see the first error above";
-    steps::run(&mut build, help)?;
+    build(checkout)?;
     println!("built {}", checkout.program("gleaner-player").display());
     Ok(Exit::Ok)
 }
 
-/// Cargo with the tools for the player, which are fetched if the system lacks them.
-pub(crate) fn cargo(checkout: &Checkout) -> Result<Command, Failure> {
+/// Builds the player for this machine.
+pub(crate) fn build(checkout: &Checkout) -> Result<(), Failure> {
+    let mut build = cargo(checkout, &compiler())?;
+    // With the features of the whole workspace, so that shared dependencies are built once.
+    build.args(["build", "--release", "--workspace", "--bin", "gleaner-player"]);
+    let help = "if a C compiler is missing, install one (`cc`); else see the first error above";
+    steps::run(&mut build, help)
+}
+
+/// The C compiler of this machine.
+pub(crate) fn compiler() -> String {
+    env::var("CC").unwrap_or_else(|_| "cc".to_owned())
+}
+
+/// Cargo with the tools for the player, which are fetched if the system lacks them; `compiler` is
+/// the one that builds the player.
+pub(crate) fn cargo(checkout: &Checkout, compiler: &str) -> Result<Command, Failure> {
     let lacks_cmake = !steps::succeeds(checkout.command("cmake").arg("--version"));
     let lacks_libclang = env::var_os("LIBCLANG_PATH").is_none() && !has_libclang();
     if lacks_cmake || lacks_libclang {
@@ -43,7 +53,7 @@ pub(crate) fn cargo(checkout: &Checkout) -> Result<Command, Failure> {
     }
     // libclang has no stddef.h and the like, and needs the path of those of the C compiler.
     if env::var_os("BINDGEN_EXTRA_CLANG_ARGS").is_none() {
-        cargo.env("BINDGEN_EXTRA_CLANG_ARGS", format!("-I{}", headers(checkout)?));
+        cargo.env("BINDGEN_EXTRA_CLANG_ARGS", format!("-I{}", headers(checkout, compiler)?));
     }
     Ok(cargo)
 }
@@ -103,8 +113,9 @@ fn fetched_libclang(checkout: &Checkout) -> Result<PathBuf, Failure> {
     Ok(PathBuf::from(folder.trim()))
 }
 
-fn headers(checkout: &Checkout) -> Result<String, Failure> {
-    let mut compiler = checkout.command(env::var_os("CC").unwrap_or_else(|| "cc".into()));
+/// Returns the folder with the headers of a C compiler.
+pub(crate) fn headers(checkout: &Checkout, compiler: &str) -> Result<String, Failure> {
+    let mut compiler = checkout.command(compiler);
     compiler.arg("-print-file-name=include");
     let folder = steps::output(&mut compiler, "install a C compiler (`cc`)")?;
     Ok(folder.trim().to_owned())

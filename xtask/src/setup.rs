@@ -78,6 +78,15 @@ pub(crate) fn programs(checkout: &Checkout) -> Result<(), Failure> {
     )
 }
 
+/// Builds the program that measures.
+pub(crate) fn binary(checkout: &Checkout, name: &str) -> Result<(), Failure> {
+    let mut build = checkout.cargo();
+    // Only the binary is named: cargo selects features by the named packages, and other features
+    // would compile dependencies twice.
+    build.args(["build", "--release", "--bin", name]);
+    steps::run(&mut build, "see the first error above")
+}
+
 /// Builds the lambdas in these folders.
 pub(crate) fn build_lambdas(checkout: &Checkout, folders: &[PathBuf]) -> Result<(), Failure> {
     for lambda in folders {

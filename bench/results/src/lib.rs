@@ -6,6 +6,7 @@
 //! - [`Summary`] has the statistics of a series, and [`MeasuredDifference`] compares two.
 //! - [`Comparison`] compares two runs.
 //! - [`IsolationCosts`] become a recommendation.
+//! - [`SequenceEntry`] is one of several benchmarks that ran one after the other.
 //! - [`Machine`] is where a run took place, and [`PowerMeter`] measures the power that it takes.
 
 mod comparison;
@@ -17,6 +18,7 @@ mod page;
 mod power;
 mod recommendation;
 mod results;
+mod sequence;
 mod statistics;
 #[cfg(test)]
 #[path = "../../../base/src/test_folder.rs"]
@@ -29,4 +31,5 @@ pub use machine::Machine;
 pub use power::PowerMeter;
 pub use recommendation::{AttackCounts, IsolationCosts, KindValues, WakeCosts};
 pub use results::{BenchResults, Reception, Series, SeriesGroup};
+pub use sequence::{BenchEnd, OUTPUT, SequenceEntry};
 pub use statistics::{MeasuredDifference, Summary, quantile};

@@ -1,7 +1,7 @@
 //! The plain Python program for comparison, `bench/baselines/detector.py`.
 
 use std::io::{BufRead, BufReader, Lines, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 
 use gleaner_tests::root;
@@ -10,6 +10,7 @@ use serde_json::Value;
 use super::frames::{HEIGHT, WIDTH};
 use super::model_process::BenchModel;
 use super::{MAX_COUNT, MAX_IOU, MIN_SCORE, THREADS};
+use crate::measure::python;
 
 /// The started program.
 pub(super) struct PythonProgram {
@@ -31,8 +32,7 @@ pub(super) struct PythonResult {
 impl PythonProgram {
     /// Starts it; returns the reason if it lacks a library.
     pub(super) fn start(model: &BenchModel, frames: &Path) -> Result<Self, String> {
-        let python = std::env::var_os("GLEANER_BENCH_PYTHON")
-            .unwrap_or_else(|| root().join(".venv/bin/python3").into());
+        let python = std::env::var_os("GLEANER_BENCH_PYTHON").map_or_else(python, PathBuf::from);
         let numbers = [
             WIDTH.to_string(),
             HEIGHT.to_string(),
@@ -49,7 +49,7 @@ impl PythonProgram {
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .spawn()
-            .map_err(|error| format!("cannot start `{}`: {error}", Path::new(&python).display()))?;
+            .map_err(|error| format!("cannot start `{}`: {error}", python.display()))?;
         let requests = child.stdin.take();
         let replies = BufReader::new(child.stdout.take().expect("a pipe")).lines();
         let mut started = Self { child, requests, replies, runtime: String::new() };

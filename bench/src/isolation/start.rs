@@ -5,10 +5,10 @@ use std::process::{Command, Stdio};
 use std::time::Instant;
 
 use gleaner_tests::drive::{CdrBuilder, IMAGE, one_topic};
-use gleaner_tests::{TempFolder, program, root, runtime};
+use gleaner_tests::{TempFolder, program, runtime};
 
 use crate::live::lambda;
-use crate::measure::{Twin, median};
+use crate::measure::{Twin, median, python};
 use gleaner_bench_results::{Figure, KindValues};
 
 /// Goals for the lifetime in ms: wasm, and Python without imports of the lambda.
@@ -52,10 +52,8 @@ pub(super) fn figures(rounds: usize, figures: &mut Vec<Figure>) -> KindValues {
             below_shim,
         ));
     }
-    let python = std::env::var_os("GLEANER_PYTHON")
-        .unwrap_or_else(|| root().join(".venv/bin/python3").into());
     let empty = (0..rounds).map(|_| {
-        let mut python = Command::new(&python);
+        let mut python = Command::new(python());
         python.args(["-I", "-c", "pass"]);
         lifetime_ms(python)
     });

@@ -71,22 +71,24 @@ fn start_in_private_network() -> Result<bool, String> {
     if raised || std::fs::read_to_string(BUFFER_LIMIT).is_ok_and(|after| after != before) {
         let _ = std::fs::write(BUFFER_LIMIT, before.trim());
     }
-    status.map(|status| status.success()).map_err(|error| error.to_string())
+    status.map(|(status, _)| status.success()).map_err(|error| error.to_string())
 }
 
 /// Runs a command to its end. A signal that asks this program to end is passed on, so that the end
-/// is waited for, and the limit restored.
-fn until_end(command: &mut Command) -> io::Result<ExitStatus> {
+/// is waited for, and the limit restored. Returns also whether there was such a signal.
+pub(crate) fn until_end(command: &mut Command) -> io::Result<(ExitStatus, bool)> {
     let is_asked = Arc::<AtomicBool>::default();
     for asks in [SIGINT, SIGTERM] {
         signal_hook::flag::register(asks, Arc::clone(&is_asked))?;
     }
     let mut child = command.spawn()?;
+    let mut was_asked = false;
     loop {
         if let Some(status) = child.try_wait()? {
-            return Ok(status);
+            return Ok((status, was_asked || is_asked.load(Ordering::Relaxed)));
         }
         if is_asked.swap(false, Ordering::Relaxed) {
+            was_asked = true;
             signal(child.id(), "TERM");
         }
         thread::sleep(Duration::from_millis(100));

@@ -15,6 +15,7 @@ use std::env;
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
+use std::process::Command;
 
 use gleaner_base::{Exit, Failure};
 
@@ -22,7 +23,8 @@ use crate::checkout::Checkout;
 use crate::setup;
 use crate::steps::{self, Steps};
 use cases::{CASES, Machine, ReplayCase};
-use tools::{TARGET, Tools};
+use tools::Emulator;
+pub(crate) use tools::{TARGET, Tools};
 
 /// The programs that are run.
 const PROGRAMS: [&str; 4] = ["gleaner", "gleaner-compile", "gleaner-inference", "gleaner-runtime"];
@@ -37,12 +39,14 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     let mut steps = Steps::of(5);
     steps.begin(&format!("cross compiler, emulator and compilation target {TARGET}"));
     let tools = Tools::find(checkout)?;
+    let emulator = Emulator::find(checkout, &tools)?;
     steps.begin("programs and lambdas for this machine (the first time this takes minutes)");
     setup::target(checkout, setup::TARGET)?;
     setup::programs(checkout)?;
     setup::build_lambdas(checkout, &cases::lambdas())?;
     steps.begin(&format!("programs for {TARGET} (the first time this takes minutes)"));
-    let emulated = emulated(checkout, &tools)?;
+    let built = build(&mut tools.cargo(checkout), checkout, &[])?;
+    let emulated = scripts(checkout, &built, &emulator)?;
     println!("built {}", checkout.target().join(TARGET).join("release").display());
     steps.begin("native code of the other processor must be refused");
     let (here, there) = (Machine::here(checkout), Machine::emulated(checkout, emulated));
@@ -55,27 +59,33 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     Ok(if unexpected == 0 { Exit::Ok } else { Exit::Differs })
 }
 
-/// Builds the programs of a vehicle, and returns their folder.
+/// Builds the programs of packages, and returns their folder.
 pub(crate) fn programs(checkout: &Checkout) -> Result<PathBuf, Failure> {
-    build(checkout, &Tools::find(checkout)?)
+    build(&mut Tools::find(checkout)?.cargo(checkout), checkout, &[])
 }
 
-fn build(checkout: &Checkout, tools: &Tools) -> Result<PathBuf, Failure> {
-    let mut build = tools.cargo(checkout);
-    build.args(["build", "--release", "--target", TARGET]);
-    build.args(setup::PROGRAMS.iter().flat_map(|package| ["-p", package]));
-    steps::run(&mut build, "see the first error above")?;
+/// As [`programs`], with the packages `others` of cargo, of which one is the player.
+pub(crate) fn programs_with_player(
+    checkout: &Checkout,
+    tools: &Tools,
+    others: &[&str],
+) -> Result<PathBuf, Failure> {
+    build(&mut tools.cargo_with_player(checkout)?, checkout, others)
+}
+
+fn build(cargo: &mut Command, checkout: &Checkout, others: &[&str]) -> Result<PathBuf, Failure> {
+    cargo.args(["build", "--release", "--target", TARGET]);
+    cargo.args(setup::PROGRAMS.iter().chain(others).flat_map(|package| ["-p", package]));
+    steps::run(cargo, "see the first error above")?;
     Ok(checkout.target().join(TARGET).join("release"))
 }
 
-/// Builds the programs, and writes a script for each one that starts it emulated. Returns the
-/// folder of the scripts.
-fn emulated(checkout: &Checkout, tools: &Tools) -> Result<PathBuf, Failure> {
-    let built = build(checkout, tools)?;
+/// Writes a script for each program that starts it emulated. Returns the folder of the scripts.
+fn scripts(checkout: &Checkout, built: &Path, emulator: &Emulator<'_>) -> Result<PathBuf, Failure> {
     let scripts = checkout.target().join(TARGET).join("emulated");
-    let here = (SHIM, Tools::native_script(&checkout.program(SHIM)));
+    let here = (SHIM, Emulator::native_script(&checkout.program(SHIM)));
     for (name, script) in
-        PROGRAMS.map(|name| (name, tools.script(&built.join(name)))).into_iter().chain([here])
+        PROGRAMS.map(|name| (name, emulator.script(&built.join(name)))).into_iter().chain([here])
     {
         write_program(&scripts, name, &script).map_err(|error| {
             Failure::caused_by(

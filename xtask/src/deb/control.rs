@@ -4,34 +4,38 @@ use std::path::Path;
 
 use gleaner_base::Failure;
 
+use super::answer;
 use super::source::{LIB, PackageSource};
 use super::tree::{self, PackageTree};
-use super::{Architecture, answer};
+use crate::architecture::Architecture;
 use crate::checkout::Checkout;
+use crate::glibc::GlibcNeeds;
 use crate::steps;
 
 /// Scripts that dpkg runs.
 const SCRIPTS: [&str; 3] = ["postinst", "prerm", "postrm"];
 
-pub(super) struct PackageMetadata {
-    source: &'static PackageSource,
-    version: String,
-    architecture: Architecture,
-    libraries: String,
-    /// Time of the commit, in s since 1970.
-    pub(super) time: String,
+/// The commit that is packaged.
+pub(crate) struct PackagedCommit {
+    /// Version of all packages of it.
+    pub(crate) version: String,
+    /// Its time, in s since 1970: files of packages get it, so that the same files become the same
+    /// package.
+    pub(crate) time: String,
     /// The same in the format of mails.
     date: String,
 }
 
-impl PackageMetadata {
-    /// Collects the metadata for the files in `tree`.
-    pub(super) fn collect(
-        checkout: &Checkout,
-        tree: &PackageTree,
-        architecture: Architecture,
-        source: &'static PackageSource,
-    ) -> Result<Self, Failure> {
+pub(super) struct PackageMetadata {
+    source: &'static PackageSource,
+    architecture: Architecture,
+    libraries: String,
+    pub(super) commit: PackagedCommit,
+}
+
+impl PackagedCommit {
+    /// Returns the commit of the checkout.
+    pub(crate) fn of(checkout: &Checkout) -> Self {
         let git = |arguments: &[&str]| answer(checkout.command("git").args(arguments));
         let release = env!("CARGO_PKG_VERSION");
         // A later commit is a later version, so that `apt` upgrades to it.
@@ -43,20 +47,29 @@ impl PackageMetadata {
         let time = git(&["log", "-1", "--format=%ct"]).unwrap_or_else(|| "0".to_owned());
         let date = git(&["log", "-1", "--format=%cD"])
             .unwrap_or_else(|| "Thu, 01 Jan 1970 00:00:00 +0000".to_owned());
-        let found = if architecture == Architecture::of_this_machine() {
-            libraries(checkout, tree)?
-        } else {
-            None
-        };
+        Self { version, time, date }
+    }
+}
+
+impl PackageMetadata {
+    /// Collects the metadata for the files in `tree`.
+    pub(super) fn collect(
+        checkout: &Checkout,
+        tree: &PackageTree,
+        architecture: Architecture,
+        source: &'static PackageSource,
+    ) -> Result<Self, Failure> {
+        let found =
+            if architecture.is_of_this_machine() { libraries(checkout, tree)? } else { None };
         let libraries = match found {
             Some(found) => found,
-            None => libraries_by_version(tree)?,
+            None => libraries_by_version(checkout, tree)?,
         };
-        Ok(Self { source, version, architecture, libraries, time, date })
+        Ok(Self { source, architecture, libraries, commit: PackagedCommit::of(checkout) })
     }
 
     pub(super) fn file_name(&self) -> String {
-        format!("{}_{}_{}.deb", self.source.name, self.version, self.architecture.name())
+        format!("{}_{}_{}.deb", self.source.name, self.commit.version, self.architecture.name())
     }
 
     /// Writes Debian's changelog: one entry for this package.
@@ -71,9 +84,9 @@ impl PackageMetadata {
             "{} ({}) unstable; urgency=medium\n\n  * CHANGELOG.md in this folder lists what \
              changes for users.\n\n -- {}  {}\n",
             self.source.name,
-            self.version,
+            self.commit.version,
             maintainer.unwrap_or_default(),
-            self.date
+            self.commit.date
         );
         tree.write(&format!("{}/changelog", self.source.doc()), &entry).map(drop)
     }
@@ -85,7 +98,7 @@ impl PackageMetadata {
         let size: u64 = files.iter().map(|file| kib(file)).sum();
         let folder = checkout.path(self.source.folder).join("debian");
         let control = tree::read(&folder.join("control"))?
-            .replace("@VERSION@", &self.version)
+            .replace("@VERSION@", &self.commit.version)
             .replace("@ARCHITECTURE@", self.architecture.name())
             .replace("@LIBRARIES@", &self.libraries)
             .replace("@INSTALLED_SIZE@", &size.to_string());
@@ -138,28 +151,13 @@ fn libraries(checkout: &Checkout, tree: &PackageTree) -> Result<Option<String>, 
 
 /// Returns the libraries, with the newest version of the C library that a program names. For
 /// another architecture `dpkg-shlibdeps` would need its packages.
-fn libraries_by_version(tree: &PackageTree) -> Result<String, Failure> {
-    let mut newest = 0;
+fn libraries_by_version(checkout: &Checkout, tree: &PackageTree) -> Result<String, Failure> {
+    let mut newest = None;
     for file in tree.files()?.into_iter().filter(|file| is_elf(file)) {
-        let bytes = std::fs::read(&file).map_err(|error| tree::cannot("read", &file, &error))?;
-        newest = newest.max(glibc(&bytes));
+        newest = newest.max(GlibcNeeds::of(checkout, &file)?.newest());
     }
-    Ok(format!("libc6 (>= 2.{newest}), libgcc-s1 (>= 4.2)"))
-}
-
-/// The newest minor version of the C library in the names of versions of a program.
-fn glibc(program: &[u8]) -> u32 {
-    const NAME: &[u8] = b"\0GLIBC_2.";
-    let names = program.windows(NAME.len()).enumerate().filter(|(_, window)| *window == NAME);
-    let minors = names.filter_map(|(at, _)| {
-        let digits: String = program[at + NAME.len()..]
-            .iter()
-            .take_while(|byte| byte.is_ascii_digit())
-            .map(|byte| char::from(*byte))
-            .collect();
-        digits.parse::<u32>().ok()
-    });
-    minors.max().unwrap_or_default()
+    let libc6 = newest.map_or("libc6".to_owned(), |newest| format!("libc6 (>= {newest})"));
+    Ok(format!("{libc6}, libgcc-s1 (>= 4.2)"))
 }
 
 fn is_elf(file: &Path) -> bool {
@@ -167,15 +165,4 @@ fn is_elf(file: &Path) -> bool {
     let mut start = [0; 4];
     let read = std::fs::File::open(file).and_then(|mut file| file.read_exact(&mut start));
     read.is_ok() && start == *b"\x7fELF"
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_newest_version_of_the_c_library_counts() {
-        assert_eq!(glibc(b"\x7fELF\0GLIBC_2.34\0GLIBC_2.4\0GLIBC_2.17\0x"), 34);
-        assert_eq!(glibc(b"no names"), 0);
-    }
 }

@@ -3,7 +3,6 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::slice;
 
 use gleaner_base::{Exit, Failure};
 use serde::Deserialize;
@@ -11,7 +10,7 @@ use serde::Deserialize;
 use super::source::PackageSource;
 use super::tree::PackageTree;
 use crate::checkout::Checkout;
-use crate::{setup, steps};
+use crate::steps;
 
 #[derive(Deserialize)]
 struct CargoMetadata {
@@ -42,8 +41,8 @@ pub(super) fn write(
     let mut linked = checkout.cargo();
     linked.args(["tree", "--locked", "--offline", "--edges=normal", "--prefix=none"]);
     linked.args(["--format={p}", "--target=all"]);
-    let packages: &[&str] = source.cargo_package.as_ref().map_or(&setup::PROGRAMS, slice::from_ref);
-    linked.args(packages.iter().flat_map(|package| ["--package", package]));
+    let packages = source.cargo_packages.iter().copied().flatten();
+    linked.args(packages.flat_map(|package| ["--package", package]));
     let linked = steps::output(&mut linked, help)?;
     // A line is `NAME vVERSION`, with a path or a mark.
     let linked: BTreeSet<(&str, &str)> = linked

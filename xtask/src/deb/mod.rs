@@ -13,53 +13,26 @@ mod source;
 mod tree;
 mod unit;
 
-use std::env;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use gleaner_base::{Exit, Failure};
 
+use crate::architecture::Architecture;
 use crate::checkout::Checkout;
 use crate::steps::{self, Steps};
 use crate::{aarch64, setup};
 use control::PackageMetadata;
-use source::{PACKAGES, PackageSource};
-use tree::PackageTree;
+pub(crate) use control::PackagedCommit;
+use source::PACKAGES;
+pub(crate) use source::{LIB, PackageSource, VEHICLE_PROGRAMS};
+pub(crate) use tree::{PackageTree, cannot};
 
 const USAGE: &str = "usage: cargo xtask deb [--arch amd64|arm64] [--programs DIR] [--test]
   --arch      architecture of the packages; default: that of this machine
   --programs  folder with the built programs; default: build them
   --test      as root: install, run, upgrade and purge each in a root that debootstrap makes";
-
-/// Architectures of the package, by Debian's names.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Architecture {
-    Amd64,
-    Arm64,
-}
-
-impl Architecture {
-    fn of_this_machine() -> Self {
-        if env::consts::ARCH == "aarch64" { Self::Arm64 } else { Self::Amd64 }
-    }
-
-    fn name(self) -> &'static str {
-        match self {
-            Self::Amd64 => "amd64",
-            Self::Arm64 => "arm64",
-        }
-    }
-
-    /// Tool of the package binutils, for programs of this architecture.
-    fn strip(self) -> &'static str {
-        match self {
-            _ if self == Self::of_this_machine() => "strip",
-            Self::Amd64 => "x86_64-linux-gnu-strip",
-            Self::Arm64 => "aarch64-linux-gnu-strip",
-        }
-    }
-}
 
 #[derive(Debug, PartialEq, Eq)]
 struct DebOptions {
@@ -78,8 +51,8 @@ impl DebOptions {
                 (_, true) => options.test = true,
                 (Some("--arch"), _) => {
                     let name = arguments.next();
-                    let known = [Architecture::Amd64, Architecture::Arm64];
-                    let known = known.into_iter().find(|it| name.is_some_and(|is| is == it.name()));
+                    let mut all = Architecture::ALL.into_iter();
+                    let known = all.find(|it| name.is_some_and(|is| is == it.name()));
                     options.architecture = known.ok_or_else(usage)?;
                 }
                 (Some("--programs"), _) => {
@@ -88,7 +61,7 @@ impl DebOptions {
                 _ => return Err(usage()),
             }
         }
-        if options.test && options.architecture != Architecture::of_this_machine() {
+        if options.test && !options.architecture.is_of_this_machine() {
             let message = "a package of another architecture cannot be tested on this machine";
             return Err(Failure::new(Exit::Usage, message));
         }
@@ -104,6 +77,40 @@ fn usage() -> Failure {
 pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
     let options = DebOptions::parse(arguments)?;
     let architecture = options.architecture;
+    check_tools(checkout, architecture)?;
+    let each = if options.test { STEPS + 1 } else { STEPS };
+    let mut steps = Steps::of(1 + PACKAGES.len() * each);
+    steps.begin(&format!("programs for {}", architecture.name()));
+    let programs = programs(checkout, &options)?;
+    println!("{}", programs.display());
+    for source in &PACKAGES {
+        let package = package(checkout, &mut steps, architecture, &programs, source)?;
+        if options.test {
+            steps.begin(&format!("{}: installation in a root of its own", source.name));
+            root::test(checkout, &package, &folder(checkout), source)?;
+        }
+    }
+    Ok(Exit::Ok)
+}
+
+/// Steps for each package.
+const STEPS: usize = 3;
+/// Steps of [`packages`].
+pub(crate) const ALL_STEPS: usize = PACKAGES.len() * STEPS;
+
+/// Builds all packages from the programs in a folder, and returns their files.
+pub(crate) fn packages(
+    checkout: &Checkout,
+    steps: &mut Steps,
+    architecture: Architecture,
+    programs: &Path,
+) -> Result<Vec<PathBuf>, Failure> {
+    let build = |source| package(checkout, steps, architecture, programs, source);
+    PACKAGES.iter().map(build).collect()
+}
+
+/// Checks that the tools for packages of `architecture` are installed.
+pub(crate) fn check_tools(checkout: &Checkout, architecture: Architecture) -> Result<(), Failure> {
     for (tool, package) in
         [("dpkg-deb", "dpkg"), ("gzip", "gzip"), (architecture.strip(), "binutils")]
     {
@@ -112,30 +119,25 @@ pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, F
                 .with_help(format!("on Debian and Ubuntu, as root: apt-get install {package}")));
         }
     }
-    let each = if options.test { 4 } else { 3 };
-    let mut steps = Steps::of(1 + PACKAGES.len() * each);
-    steps.begin(&format!("programs for {}", architecture.name()));
-    let programs = programs(checkout, &options)?;
-    println!("{}", programs.display());
-    for source in &PACKAGES {
-        package(checkout, &mut steps, &options, &programs, source)?;
-    }
-    Ok(Exit::Ok)
+    Ok(())
+}
+
+fn folder(checkout: &Checkout) -> PathBuf {
+    checkout.target().join("deb")
 }
 
 fn package(
     checkout: &Checkout,
     steps: &mut Steps,
-    options: &DebOptions,
+    architecture: Architecture,
     programs: &Path,
     source: &'static PackageSource,
-) -> Result<(), Failure> {
-    let (name, architecture) = (source.name, options.architecture);
+) -> Result<PathBuf, Failure> {
+    let name = source.name;
     steps.begin(&format!("{name}: files"));
-    let work = checkout.target().join("deb");
+    let work = folder(checkout);
     let root = work.join(architecture.name()).join(name);
     let tree = PackageTree::create(checkout, &root, programs, architecture, source)?;
-    licences::write(checkout, &tree, source)?;
     let metadata = PackageMetadata::collect(checkout, &tree, architecture, source)?;
     metadata.write_changelog(checkout, &tree)?;
     tree.finish()?;
@@ -147,17 +149,13 @@ fn package(
     build(checkout, &tree, &package, &metadata)?;
     lint(checkout, &package, source)?;
     println!("built {} ({} MiB)", package.display(), size_mib(&package));
-    if options.test {
-        steps.begin(&format!("{name}: installation in a root of its own"));
-        root::test(checkout, &package, &work, source)?;
-    }
-    Ok(())
+    Ok(package)
 }
 
 fn programs(checkout: &Checkout, options: &DebOptions) -> Result<PathBuf, Failure> {
     match &options.programs {
         Some(folder) => Ok(folder.clone()),
-        None if options.architecture == Architecture::of_this_machine() => {
+        None if options.architecture.is_of_this_machine() => {
             setup::programs(checkout)?;
             Ok(checkout.target().join("release"))
         }
@@ -175,7 +173,7 @@ fn build(
 ) -> Result<(), Failure> {
     let mut build = checkout.command("dpkg-deb");
     // No file is newer than the commit: the same files become the same package.
-    build.env("SOURCE_DATE_EPOCH", &metadata.time);
+    build.env("SOURCE_DATE_EPOCH", &metadata.commit.time);
     build.args(["--build", "--root-owner-group", "-Zxz"]).arg(tree.root()).arg(package);
     steps::run(&mut build, "see the error above")
 }
@@ -196,7 +194,7 @@ fn lint(checkout: &Checkout, package: &Path, source: &PackageSource) -> Result<(
     steps::run(&mut lintian, "mend the package, or add the tag with its reason to `lintian`")
 }
 
-fn size_mib(file: &Path) -> u64 {
+pub(crate) fn size_mib(file: &Path) -> u64 {
     file.metadata().map_or(0, |data| data.len().div_ceil(1 << 20))
 }
 

@@ -1,54 +1,60 @@
 //! The packages: what each consists of.
 
-/// A Debian package.
-pub(super) struct PackageSource {
-    pub(super) name: &'static str,
+use crate::setup;
+
+/// A package of programs and their files.
+pub(crate) struct PackageSource {
+    pub(crate) name: &'static str,
     /// Folder of its files that are not built.
-    pub(super) folder: &'static str,
+    pub(crate) folder: &'static str,
     /// Built programs with their folders.
-    pub(super) programs: &'static [(&'static str, &'static str)],
+    pub(crate) programs: &'static [&'static [(&'static str, &'static str)]],
     /// Files of `folder` with their places.
-    pub(super) files: &'static [(&'static str, &'static str)],
-    /// Package of cargo whose crates the programs contain; without one, those of all programs.
-    pub(super) cargo_package: Option<&'static str>,
+    pub(crate) files: &'static [(&'static str, &'static str)],
+    /// Packages of cargo whose crates the programs contain.
+    pub(crate) cargo_packages: &'static [&'static [&'static str]],
     /// True if it has the command `gleaner` with its manual, and what Python lambdas need.
-    pub(super) has_command: bool,
-    /// The most exposure that `systemd-analyze security` may report, in tenths. It counts what the
-    /// service must do: the network, and for lambdas devices and memory with code.
-    pub(super) exposure_max: u32,
+    pub(crate) has_command: bool,
+    /// The most exposure that `systemd-analyze security` may report of its service, in tenths. It
+    /// counts what the service must do: the network, and for lambdas devices and memory with code.
+    pub(crate) exposure_max: u32,
 }
 
 /// Folder of the parts, where the programs search for them.
-pub(super) const LIB: &str = "usr/lib/gleaner";
+pub(crate) const LIB: &str = "usr/lib/gleaner";
 
-/// Lambdas on a vehicle: the commands, the parts that those start, and the extension module of
+/// Programs of a vehicle: the commands, the parts that those start, and the extension module of
 /// Python.
+pub(crate) const VEHICLE_PROGRAMS: [(&str, &str); 10] = [
+    ("gleaner", "usr/bin"),
+    ("gleaner-orchestrator", "usr/bin"),
+    ("gleaner-compile", LIB),
+    ("gleaner-inference", LIB),
+    ("gleaner-ingress", LIB),
+    ("gleaner-recorder", LIB),
+    ("gleaner-runtime", LIB),
+    ("gleaner-shim", LIB),
+    ("gleaner-supervisor", LIB),
+    ("lib_gleaner.so", LIB),
+];
+
+/// Lambdas on a vehicle.
 const VEHICLE: PackageSource = PackageSource {
     name: "gleaner",
     folder: "orchestrator/package",
-    programs: &[
-        ("gleaner", "usr/bin"),
-        ("gleaner-orchestrator", "usr/bin"),
-        ("gleaner-compile", LIB),
-        ("gleaner-inference", LIB),
-        ("gleaner-ingress", LIB),
-        ("gleaner-recorder", LIB),
-        ("gleaner-runtime", LIB),
-        ("gleaner-shim", LIB),
-        ("gleaner-supervisor", LIB),
-        ("lib_gleaner.so", LIB),
-    ],
+    programs: &[&VEHICLE_PROGRAMS],
     files: &[
         ("gleaner.service", "usr/lib/systemd/system/gleaner.service"),
         ("control-groups.conf", "usr/lib/gleaner/control-groups.conf"),
         ("gleaner-stop", "usr/lib/gleaner/gleaner-stop"),
         ("gleaner.sysusers", "usr/lib/sysusers.d/gleaner.conf"),
+        ("gleaner.sysctl", "usr/lib/sysctl.d/05-gleaner.conf"),
         ("vehicle.toml", "etc/gleaner/vehicle.toml"),
         ("gleaner-orchestrator.8", "usr/share/man/man8/gleaner-orchestrator.8"),
         ("debian/copyright", "usr/share/doc/gleaner/copyright"),
         ("debian/README.Debian", "usr/share/doc/gleaner/README.Debian"),
     ],
-    cargo_package: None,
+    cargo_packages: &[&setup::PROGRAMS],
     has_command: true,
     exposure_max: 20,
 };
@@ -57,7 +63,7 @@ const VEHICLE: PackageSource = PackageSource {
 const CLOUD: PackageSource = PackageSource {
     name: "gleaner-cloud",
     folder: "cloud/package",
-    programs: &[("gleaner-cloud", "usr/bin")],
+    programs: &[&[("gleaner-cloud", "usr/bin")]],
     files: &[
         ("gleaner-cloud.service", "usr/lib/systemd/system/gleaner-cloud.service"),
         ("gleaner-cloud.sysusers", "usr/lib/sysusers.d/gleaner-cloud.conf"),
@@ -65,7 +71,7 @@ const CLOUD: PackageSource = PackageSource {
         ("debian/copyright", "usr/share/doc/gleaner-cloud/copyright"),
         ("debian/README.Debian", "usr/share/doc/gleaner-cloud/README.Debian"),
     ],
-    cargo_package: Some("gleaner-cloud"),
+    cargo_packages: &[&["gleaner-cloud"]],
     has_command: false,
     exposure_max: 13,
 };

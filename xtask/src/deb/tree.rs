@@ -6,8 +6,9 @@ use std::path::{Path, PathBuf};
 
 use gleaner_base::{Exit, Failure};
 
-use super::Architecture;
+use super::licences;
 use super::source::{LIB, PackageSource};
+use crate::architecture::Architecture;
 use crate::checkout::Checkout;
 use crate::steps;
 
@@ -19,13 +20,13 @@ const COMPLETIONS: [(&str, &str); 3] = [
 ];
 
 /// A folder with the files of a package.
-pub(super) struct PackageTree {
+pub(crate) struct PackageTree {
     root: PathBuf,
 }
 
 impl PackageTree {
     /// Creates the folder `root` again, with all files but the metadata.
-    pub(super) fn create(
+    pub(crate) fn create(
         checkout: &Checkout,
         root: &Path,
         programs: &Path,
@@ -36,7 +37,7 @@ impl PackageTree {
         if root.exists() {
             fs::remove_dir_all(root).map_err(|error| cannot("remove", root, &error))?;
         }
-        for (name, folder) in source.programs {
+        for (name, folder) in source.programs.iter().copied().flatten() {
             let file = tree.place(&programs.join(name), &Path::new(folder).join(name))?;
             // Symbols are most of the size. A panic names its place without them.
             let mut strip = checkout.command(architecture.strip());
@@ -53,11 +54,12 @@ impl PackageTree {
             // The command of this machine: that of the package may be for another one.
             tree.generated(checkout, &programs.join("gleaner"), architecture)?;
         }
+        licences::write(checkout, &tree, source)?;
         Ok(tree)
     }
 
     /// Sets the modes of all files, and compresses those of which Debian demands it.
-    pub(super) fn finish(&self) -> Result<(), Failure> {
+    pub(crate) fn finish(&self) -> Result<(), Failure> {
         for file in self.files()? {
             let mode =
                 file.metadata().map_err(|error| cannot("read", &file, &error))?.permissions();
@@ -72,12 +74,12 @@ impl PackageTree {
         Ok(())
     }
 
-    pub(super) fn root(&self) -> &Path {
+    pub(crate) fn root(&self) -> &Path {
         &self.root
     }
 
     /// Writes a file.
-    pub(super) fn write(&self, place: &str, text: &str) -> Result<PathBuf, Failure> {
+    pub(crate) fn write(&self, place: &str, text: &str) -> Result<PathBuf, Failure> {
         let file = self.parent(Path::new(place))?;
         fs::write(&file, text).map_err(|error| cannot("write", &file, &error))?;
         set_mode(&file, 0o644)?;
@@ -133,7 +135,7 @@ impl PackageTree {
         architecture: Architecture,
     ) -> Result<(), Failure> {
         let own = checkout.program("gleaner");
-        let gleaner = if architecture == Architecture::of_this_machine() { gleaner } else { &own };
+        let gleaner = if architecture.is_of_this_machine() { gleaner } else { &own };
         if !gleaner.is_file() {
             println!("skipped: no manual pages, as this machine has no `{}`", gleaner.display());
             return Ok(());
@@ -151,7 +153,7 @@ impl PackageTree {
     }
 
     /// Copies `file` to `place`, with its mode.
-    fn place(&self, file: &Path, place: &Path) -> Result<PathBuf, Failure> {
+    pub(crate) fn place(&self, file: &Path, place: &Path) -> Result<PathBuf, Failure> {
         let to = self.parent(place)?;
         fs::copy(file, &to).map_err(|error| {
             cannot("copy", file, &error)
@@ -189,7 +191,7 @@ fn entries(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
     Ok(paths)
 }
 
-pub(super) fn cannot(action: &str, path: &Path, error: &std::io::Error) -> Failure {
+pub(crate) fn cannot(action: &str, path: &Path, error: &std::io::Error) -> Failure {
     Failure::caused_by(Exit::Internal, format!("cannot {action} `{}`", path.display()), error)
 }
 

@@ -69,9 +69,7 @@ pub(crate) fn run_scaled(checkout: &Checkout, arguments: &[OsString]) -> Result<
     steps.begin("programs (the first time this takes minutes)");
     setup::programs(checkout)?;
     if options.kills > 0 {
-        let mut build = checkout.cargo();
-        build.args(["build", "--release", "--bin", "gleaner-fleet-bench"]);
-        run(&mut build, "see the first error above")?;
+        setup::binary(checkout, "gleaner-fleet-bench")?;
     }
     steps.begin("three replicas");
     let mut cloud = ScaledCloud::start(checkout)?;

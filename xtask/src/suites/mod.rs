@@ -161,9 +161,9 @@ fn player_suites(checkout: &Checkout) -> Result<Vec<Suite>, Failure> {
     // With the features of the whole workspace, and in lints with those of `.ci/run`, so that
     // nothing is built twice.
     let only = ["--release", "--workspace", "--bin", "gleaner-player", "--test", "player"];
-    let mut lints = player::cargo(checkout)?;
+    let mut lints = player::cargo(checkout, &player::compiler())?;
     lints.arg("clippy").args(only).args(["--features", LINTED, "--", "-D", "warnings"]);
-    let mut tests = player::cargo(checkout)?;
+    let mut tests = player::cargo(checkout, &player::compiler())?;
     tests.arg("test").args(only);
     Ok(vec![
         suite("lints: player", SuiteAction::Run(lints, OutputFormat::None)),

@@ -1,0 +1,147 @@
+//! Several benchmarks, one after the other, and what each of them ended with.
+
+use std::fmt::Write as _;
+use std::fs;
+use std::path::Path;
+
+use crate::markdown::table;
+use crate::results::BenchResults;
+
+/// Name of the file with the output of a benchmark, beside its results.
+pub const OUTPUT: &str = "output.txt";
+
+/// A benchmark that was started, or was not to be.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SequenceEntry {
+    /// Its name.
+    pub bench: String,
+    /// Its duration in seconds.
+    pub seconds: f64,
+    /// Its end.
+    pub end: BenchEnd,
+}
+
+/// The end of a benchmark.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum BenchEnd {
+    /// It has results.
+    Measured {
+        /// The number of its goals.
+        goals: usize,
+        /// The number of those that were missed.
+        missed: usize,
+        /// Parts that were skipped, with the reasons.
+        skipped_parts: Vec<String>,
+    },
+    /// It cannot run here, or was not to run, for this reason.
+    Skipped(String),
+    /// It failed: its exit status, and the last line that it printed.
+    Failed(String),
+}
+
+impl BenchEnd {
+    /// Reads the end of a benchmark from the folder of its results and of its [`OUTPUT`]. `status`
+    /// describes its exit status.
+    pub fn read(folder: &Path, has_succeeded: bool, status: &str) -> Self {
+        let output = fs::read(folder.join(OUTPUT)).unwrap_or_default();
+        let output = String::from_utf8_lossy(&output);
+        if let Ok(results) = BenchResults::read(folder) {
+            // The values of a quick run mean nothing.
+            let figures = results.figures.iter().filter(|_| !results.is_quick);
+            let goals = figures.filter(|figure| figure.goal.is_some());
+            let missed = goals.clone().filter(|figure| !figure.is_met());
+            let skipped = results.notes.iter().filter(|note| note.contains("skipped"));
+            return Self::Measured {
+                goals: goals.count(),
+                missed: missed.count(),
+                skipped_parts: skipped.cloned().collect(),
+            };
+        }
+        let reason = output.lines().find_map(|line| line.strip_prefix("skipped: "));
+        if let Some(reason) = reason.filter(|_| has_succeeded) {
+            return Self::Skipped(reason.to_owned());
+        }
+        let mut words = status.to_owned();
+        if let Some(line) = output.lines().rfind(|line| !line.trim().is_empty()) {
+            let _ = write!(words, ": {}", line.trim());
+        }
+        Self::Failed(words)
+    }
+
+    /// Returns whether it has results, and met all goals, or was skipped.
+    pub fn is_good(&self) -> bool {
+        matches!(self, Self::Measured { missed: 0, .. } | Self::Skipped(_))
+    }
+}
+
+impl SequenceEntry {
+    /// Returns a table of all benchmarks, with the reasons below it.
+    pub fn to_markdown(entries: &[Self]) -> String {
+        let mut text = "# Gleaner bench: all\n".to_owned();
+        let heads = ["benchmark", "end", "goals met", "s"].map(str::to_owned);
+        let rows = entries.iter().map(|entry| {
+            let (end, met) = match &entry.end {
+                BenchEnd::Measured { goals, missed, .. } => {
+                    ("measured", format!("{} of {goals}", goals - missed))
+                }
+                BenchEnd::Skipped(_) => ("skipped", "-".to_owned()),
+                BenchEnd::Failed(_) => ("failed", "-".to_owned()),
+            };
+            vec![entry.bench.clone(), end.to_owned(), met, format!("{:.0}", entry.seconds)]
+        });
+        table(&mut text, &heads, rows);
+        text.push('\n');
+        for SequenceEntry { bench, end, .. } in entries {
+            let reasons: Vec<&str> = match end {
+                BenchEnd::Measured { skipped_parts, .. } => {
+                    skipped_parts.iter().map(String::as_str).collect()
+                }
+                BenchEnd::Skipped(reason) | BenchEnd::Failed(reason) => vec![reason],
+            };
+            for reason in reasons {
+                let _ = writeln!(text, "- {bench}: {reason}");
+            }
+        }
+        text
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::figure::Figure;
+    use crate::test_folder::TestFolder;
+
+    #[test]
+    fn results_count_whatever_the_exit_code_is() {
+        let folder = TestFolder::new();
+        let mut results = BenchResults::new("rtt", false);
+        results.figures.push(Figure::at_most("slow", "us", 1.0, &[2.0]));
+        results.figures.push(Figure::at_most("fast", "us", 3.0, &[2.0]));
+        results.figures.push(Figure::without_goal("any", "us", &[2.0]));
+        results.notes = vec!["rclpy: skipped: no module".to_owned(), "A note.".to_owned()];
+        results.store(&folder.path("rtt")).unwrap();
+        let end = BenchEnd::read(&folder.path("rtt"), false, "exit status: 1");
+        let skipped_parts = vec!["rclpy: skipped: no module".to_owned()];
+        assert_eq!(end, BenchEnd::Measured { goals: 2, missed: 1, skipped_parts });
+        assert!(!end.is_good());
+    }
+
+    #[test]
+    fn without_results_a_benchmark_is_skipped_or_failed_with_the_reason() {
+        let folder = TestFolder::new();
+        let read = |output: &str, has_succeeded| {
+            fs::write(folder.path(OUTPUT), output).unwrap();
+            BenchEnd::read(&folder.path(""), has_succeeded, "exit status: 101")
+        };
+        let skipped = read("skipped: no player\n", true);
+        assert_eq!(skipped, BenchEnd::Skipped("no player".to_owned()));
+        let failed = read("skipped: a part\npanicked at x\nno Python\n\n", false);
+        assert_eq!(failed, BenchEnd::Failed("exit status: 101: no Python".to_owned()));
+        assert_eq!(read("", false), BenchEnd::Failed("exit status: 101".to_owned()));
+        let entry = |bench: &str, end| SequenceEntry { bench: bench.to_owned(), seconds: 1.0, end };
+        let text = SequenceEntry::to_markdown(&[entry("rtt", skipped), entry("replay", failed)]);
+        assert!(text.contains("| rtt | skipped | - | 1 |"), "{text}");
+        assert!(text.ends_with("- rtt: no player\n- replay: exit status: 101: no Python\n"));
+    }
+}
