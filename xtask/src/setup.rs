@@ -78,7 +78,7 @@ pub(crate) fn programs(checkout: &Checkout) -> Result<(), Failure> {
     )
 }
 
-/// Builds the program that measures.
+/// Builds a program that is not installed.
 pub(crate) fn binary(checkout: &Checkout, name: &str) -> Result<(), Failure> {
     let mut build = checkout.cargo();
     // Only the binary is named: cargo selects features by the named packages, and other features

@@ -15,7 +15,7 @@ use gleaner_base::{Exit, Failure};
 
 use crate::checkout::Checkout;
 use crate::setup;
-use crate::steps::{self, Steps, run};
+use crate::steps::{self, Steps};
 use crate::venv;
 use scaled::ScaledCloud;
 use services::{find, missing};
