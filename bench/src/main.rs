@@ -168,7 +168,11 @@ impl BenchCommand {
 
     /// Returns whether it needs a network of its own.
     fn is_live(&self) -> bool {
-        matches!(self, Self::Rtt { .. } | Self::Scale | Self::Isolation { .. })
+        match self {
+            Self::Isolation { options } => options.has_attacks(),
+            Self::Rtt { .. } | Self::Scale => true,
+            _ => false,
+        }
     }
 
     /// Returns whether it has only one process at a time, which is not to move between cores.
