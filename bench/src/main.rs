@@ -47,7 +47,7 @@ enum BenchCommand {
     },
     /// Samples that one and several lambdas receive, and their costs; needs gleaner-player.
     Scale,
-    /// What isolation costs: the same lambda as native code, in wasm and in Python; memory, starts
+    /// Costs of isolation: the same lambda as native code, in wasm and in Python; memory, starts
     /// and faults; and the effect of a misbehaving lambda on others. Needs gleaner-player.
     Isolation {
         #[command(flatten)]
