@@ -54,7 +54,7 @@ enum BenchCommand {
     },
     /// Samples that one and several lambdas receive, and their costs; needs gleaner-player.
     Scale,
-    /// What isolation costs: the same lambda as native code, in wasm and in Python; memory, starts
+    /// Costs of isolation: the same lambda as native code, in wasm and in Python; memory, starts
     /// and faults; and the effect of a misbehaving lambda on others. Needs gleaner-player.
     Isolation {
         #[command(flatten)]
@@ -180,7 +180,11 @@ impl BenchCommand {
 
     /// Returns whether it needs a network of its own.
     fn is_live(&self) -> bool {
-        matches!(self, Self::Rtt { .. } | Self::Scale | Self::Isolation { .. })
+        match self {
+            Self::Isolation { options } => options.has_attacks(),
+            Self::Rtt { .. } | Self::Scale => true,
+            _ => false,
+        }
     }
 
     /// Returns whether it has only one process at a time, which is not to move between cores.

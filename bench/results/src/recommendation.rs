@@ -1,4 +1,4 @@
-//! Which kind of lambda to take, as it follows from the costs that were measured.
+//! A recommendation of a kind of lambda, which follows from the costs that were measured.
 
 use crate::markdown::number;
 use crate::statistics::MeasuredDifference;

@@ -42,6 +42,13 @@ pub struct IsolationOptions {
     seed: u64,
 }
 
+impl IsolationOptions {
+    /// Returns whether a player feeds victims of attacks.
+    pub fn has_attacks(&self) -> bool {
+        !self.no_attacks
+    }
+}
+
 /// Measures the start of a lambda of each kind; returns its medians in ms.
 pub fn starts(quick: bool, results: &mut BenchResults) -> KindValues {
     start::figures(if quick { 1 } else { STARTS }, &mut results.figures)
@@ -51,7 +58,7 @@ pub fn starts(quick: bool, results: &mut BenchResults) -> KindValues {
 pub fn measure(quick: bool, options: &IsolationOptions, results: &mut BenchResults) {
     let mut costs = costs::measure(quick, options.seed, results);
     costs.start_ms = starts(quick, results);
-    if !options.no_attacks {
+    if options.has_attacks() {
         match attacks(quick, &mut results.figures) {
             // A quick run compares nothing.
             Ok(counts) => costs.attacks = (counts.compared > 0).then_some(counts),

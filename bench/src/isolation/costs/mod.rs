@@ -1,4 +1,4 @@
-//! What isolation costs: the same lambda as a native function, as a component with and without
+//! Costs of isolation: the same lambda as a native function, as a component with and without
 //! checks, and in Python, over the same recorded input.
 //!
 //! - `sides`: the ways to run it; `native` is the function. `wakes`: time and CPU per wake.

@@ -29,7 +29,7 @@ struct RecordedWorkload {
     drive: PathBuf,
     lambdas: [LambdaCopy; 2],
     sides: &'static [WakeSide],
-    /// Whether its wakes take more of the CPU than starts vary.
+    /// True if its wakes take more of the CPU than starts vary.
     has_cpu: bool,
     /// Names of the kinds of its wakes, and the one of each wake.
     kinds: &'static [&'static str],
