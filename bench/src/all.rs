@@ -22,7 +22,7 @@ const BENCHMARKS: [(&str, &str); 9] = [
     ("record", "four minutes"),
     ("drives", "two minutes"),
     ("inference", "5 minutes"),
-    ("scale", "11 minutes"),
+    ("scale", "27 minutes"),
     ("isolation", "26 minutes"),
     ("rtt", "90 minutes"),
 ];

@@ -53,7 +53,10 @@ enum BenchCommand {
         options: rtt::RttOptions,
     },
     /// Samples that one and several lambdas receive, and their costs; needs gleaner-player.
-    Scale,
+    Scale {
+        #[command(flatten)]
+        options: live::ScaleOptions,
+    },
     /// Costs of isolation: the same lambda as native code, in wasm and in Python; memory, starts
     /// and faults; and the effect of a misbehaving lambda on others. Needs gleaner-player.
     Isolation {
@@ -137,7 +140,7 @@ fn measure(command: &BenchCommand, args: &Args) -> Result<ExitCode, Failure> {
     add_versions(&mut results);
     match command {
         BenchCommand::Rtt { options } => rtt::measure(quick, options, &mut results),
-        BenchCommand::Scale => live::loads(quick, &mut results),
+        BenchCommand::Scale { options } => live::loads(quick, options, &mut results),
         BenchCommand::Isolation { options } => isolation::measure(quick, options, &mut results),
         BenchCommand::ColdStart => drop(isolation::starts(quick, &mut results)),
         BenchCommand::Replay => results.figures = replay::figures(quick),
@@ -164,7 +167,7 @@ impl BenchCommand {
         match self {
             Self::All { .. } => "all",
             Self::Rtt { .. } => "rtt",
-            Self::Scale => "scale",
+            Self::Scale { .. } => "scale",
             Self::Isolation { .. } => "isolation",
             Self::ColdStart => "cold-start",
             Self::Replay => "replay",
@@ -182,7 +185,7 @@ impl BenchCommand {
     fn is_live(&self) -> bool {
         match self {
             Self::Isolation { options } => options.has_attacks(),
-            Self::Rtt { .. } | Self::Scale => true,
+            Self::Rtt { .. } | Self::Scale { .. } => true,
             _ => false,
         }
     }

@@ -22,7 +22,7 @@ use signal_hook::consts::{SIGINT, SIGTERM};
 use crate::measure::Twin;
 pub use busy_cores::BusyCores;
 pub(crate) use load::LiveProcesses;
-pub use scale::loads;
+pub use scale::{ScaleOptions, loads};
 
 /// Environment variable of the process in the private network: the process that started it.
 const ALONE: &str = "GLEANER_BENCH_ALONE";

@@ -1,5 +1,6 @@
 //! Loads of one and several lambdas, and how their costs grow with a number.
 
+use clap::Args;
 use gleaner_bench_results::{BenchResults, Figure, Growth, GrowthCurve};
 
 use super::load::{Load, LoadCosts, more_imu};
@@ -15,8 +16,17 @@ const FLAT: f64 = 1.2;
 /// Name, lambdas, players and seconds of a load.
 type LoadArgs<'a> = (&'a str, &'a [(&'a str, usize)], &'a [&'a [&'a str]], u32);
 
+/// A choice of loads.
+#[derive(Args, Clone)]
+pub struct ScaleOptions {
+    /// Only loads with this text in their names.
+    #[arg(long, value_name = "TEXT")]
+    only: Option<String>,
+}
+
 /// Samples that one and several lambdas receive, and their costs.
-pub fn loads(quick: bool, results: &mut BenchResults) {
+pub fn loads(quick: bool, options: &ScaleOptions, results: &mut BenchResults) {
+    let is_wanted = |name: &str| options.only.as_deref().is_none_or(|only| name.contains(only));
     let seconds = |long: u32| if quick { 2 } else { long };
     const FULL_HD: &str = "1920x1080@30";
     let rig: [&[&str]; 2] =
@@ -35,7 +45,7 @@ pub fn loads(quick: bool, results: &mut BenchResults) {
         // player.
         ("two cameras of 1080p at 30 Hz and an IMU at 1 kHz at once", &[("rig", 1)], &rig, 60),
     ];
-    for (name, lambdas, players, long) in single {
+    for (name, lambdas, players, long) in single.into_iter().filter(|load| is_wanted(load.0)) {
         let seconds = seconds(long);
         let name = name.to_owned();
         let (more_topics, kind, is_lossy) = (0, Twin::Rust, false);
@@ -103,11 +113,20 @@ pub fn loads(quick: bool, results: &mut BenchResults) {
         if let Err(why) = PacketLoss::of(0) {
             results.notes.push(format!("loss of packets is not measured: {why}"));
         } else {
-            scales.push(of_loss("one lambda on an IMU at 1 kHz", "imu", imu(1000)));
-            scales.push(of_loss("one lambda on 1080p at 10 Hz", "camera", full_hd(10)));
+            scales.push(of_loss(
+                "one lambda on an IMU at 1 kHz, with lost packets",
+                "imu",
+                imu(1000),
+            ));
+            scales.push(of_loss(
+                "one lambda on 1080p at 10 Hz, with lost packets",
+                "camera",
+                full_hd(10),
+            ));
         }
     }
-    scales.iter().for_each(|scale| scale.measure(seconds, results));
+    let wanted = scales.iter().filter(|scale| is_wanted(&scale.name));
+    wanted.for_each(|scale| scale.measure(seconds, results));
 }
 
 /// Arguments of a player of raw images.
