@@ -238,7 +238,7 @@ impl AttackCounts {
             seen => format!("and in {seen} it was seen"),
         };
         format!(
-            "A misbehaving lambda on another core could not be told from the noise of this machine \
+            "A misbehaving lambda on another core could not be distinguished from the noise of this machine \
              in {unseen} of {compared} comparisons, {seen}."
         )
     }

@@ -27,8 +27,8 @@ const KERNELS: [(&str, Option<f64>); 9] = [
     ("mean", None),
 ];
 
-/// Engine settings. Overheads are relative to the first; that of NaNs is relative to the fourth, the
-/// settings of the runtime.
+/// Engine settings. Overheads are relative to the first; that of NaNs is relative to the fourth,
+/// the settings of the runtime.
 const ENGINES: [EngineChecks; 5] = [
     EngineChecks::NONE,
     EngineChecks::FUEL,

@@ -1,5 +1,6 @@
-"""Measures calls of the host, and ways to the pixels of a frame; reports the CPU time of each in ns,
-as the score of an event."""
+"""Measures calls of the host, and ways to the pixels of a frame.
+
+It reports the CPU time of each in ns, as the score of an event."""
 
 import time
 import timeit

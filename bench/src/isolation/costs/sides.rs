@@ -114,7 +114,7 @@ impl WakeSide {
     }
 }
 
-/// CPU time of all children that have ended, and of theirs.
+/// CPU time of all children that have ended, with that of their own children.
 fn cpu_us_of_children() -> f64 {
     let usage = getrusage(UsageWho::RUSAGE_CHILDREN).expect("a process has children");
     (usage.user_time() + usage.system_time()).num_microseconds() as f64
