@@ -125,7 +125,11 @@ fn line(end: &BenchEnd) -> String {
                 0 => String::new(),
                 parts => format!(", {parts} notes on skipped parts"),
             };
-            format!("measured, {} of {goals} goals met{skipped}", goals - missed)
+            let met = match goals {
+                0 => String::new(),
+                _ => format!(", {} of {goals} goals met", goals - missed),
+            };
+            format!("measured{met}{skipped}")
         }
         BenchEnd::Skipped(reason) => format!("skipped: {reason}"),
         BenchEnd::Failed(reason) => format!("FAILED: {reason}"),
