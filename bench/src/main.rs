@@ -26,7 +26,7 @@ use gleaner_tests::root;
 
 /// Measures Gleaner against its performance goals; ends with exit code 1 if one is not met.
 #[derive(Parser)]
-#[command(name = "gleaner-bench", bin_name = "cargo xtask bench")]
+#[command(name = "gleaner-bench", version, bin_name = "cargo xtask bench")]
 struct Args {
     /// Fewer and shorter rounds: shows that a benchmark works; the values mean nothing.
     #[arg(long, global = true)]

@@ -74,6 +74,10 @@ impl Checkout {
     /// is installed.
     pub(crate) fn command(&self, program: impl AsRef<OsStr>) -> Command {
         let mut command = Command::new(program);
+        // Set by hooks of git, these would let it work on another checkout.
+        for name in ["GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE", "GIT_COMMON_DIR"] {
+            command.env_remove(name);
+        }
         command
             .current_dir(&self.root)
             .env("CARGO", &self.cargo)

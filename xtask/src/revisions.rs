@@ -18,6 +18,20 @@ const USAGE: &str =
 /// Runs of each revision. Rows with fewer than five values get no verdict.
 const ROUNDS: usize = 5;
 
+/// Benchmarks with results that can be compared.
+const BENCHMARKS: [&str; 10] = [
+    "rtt",
+    "scale",
+    "isolation",
+    "cold-start",
+    "replay",
+    "record",
+    "drives",
+    "kernels",
+    "inference",
+    "fleet",
+];
+
 /// Benchmarks that need gleaner-player, which is not built with the other programs.
 const LIVE: [&str; 3] = ["rtt", "scale", "isolation"];
 
@@ -38,6 +52,11 @@ pub(crate) fn measure(
     rest: &[OsString],
 ) -> Result<[PathBuf; 2], Failure> {
     let (rounds, options) = rounds(rest)?;
+    if !BENCHMARKS.iter().any(|known| name == *known) {
+        let message = format!("`{}` cannot be measured in two revisions", name.display());
+        return Err(Failure::new(Exit::Usage, message)
+            .with_help(format!("name one of these: {}", BENCHMARKS.join(", "))));
+    }
     let folder = checkout.target().join("revisions");
     fs::create_dir_all(&folder).map_err(|error| cannot_use(&folder, &error))?;
     let lock = File::create(folder.join("lock")).map_err(|error| cannot_use(&folder, &error))?;
@@ -86,24 +105,18 @@ impl Revision {
     /// shows that this revision can be measured.
     fn prepare(&self, checkout: &Checkout, name: &OsStr) -> Result<(), Failure> {
         let folder = self.checkout.path("");
-        if folder.join(".git").is_file() {
-            // Also after an interrupted checkout.
-            let mut restore = self.checkout.command("git");
-            restore.args(["checkout", "--quiet", "--force", "--detach", &self.commit]);
-            steps::run(&mut restore, "see the message of git above")?;
-        } else {
+        let mut restore = self.checkout.command("git");
+        restore.args(["checkout", "--quiet", "--force", "--detach", &self.commit]);
+        if !folder.join(".git").is_file() || !steps::succeeds(&mut restore) {
+            // There is none yet, or git was interrupted in it.
+            remove(&folder)?;
             let mut add = checkout.command("git");
             add.args(["worktree", "add", "--force", "--detach"]).arg(&folder).arg(&self.commit);
             steps::run(&mut add, "see the message of git above")?;
         }
         let trial = self.checkout.target().join("bench/trial");
         for old in [&self.runs, &trial] {
-            match fs::remove_dir_all(old) {
-                Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-                    return Err(cannot_use(old, &error));
-                }
-                _ => {}
-            }
+            remove(old)?;
         }
         if LIVE.iter().any(|live| name == *live) {
             let mut player = self.checkout.cargo();
@@ -164,6 +177,16 @@ fn commit(checkout: &Checkout, revision: &OsStr) -> Result<String, Failure> {
     Ok(commit.trim().to_owned())
 }
 
+/// Removes a folder, if there is one.
+fn remove(folder: &Path) -> Result<(), Failure> {
+    match fs::remove_dir_all(folder) {
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+            Err(cannot_use(folder, &error))
+        }
+        _ => Ok(()),
+    }
+}
+
 fn warn_of_changes(checkout: &Checkout) -> Result<(), Failure> {
     let mut status = checkout.command("git");
     status.args(["status", "--porcelain", "--untracked-files=no"]);
@@ -180,8 +203,6 @@ fn cannot_use(path: &Path, error: &std::io::Error) -> Failure {
 
 #[cfg(test)]
 mod tests {
-    use std::process::Command;
-
     use super::*;
     use crate::test_folder::TestFolder;
 
@@ -214,20 +235,19 @@ exit 1
             repository
         }
 
+        fn checkout(&self) -> Checkout {
+            let (root, cargo) = (self.0.root().to_owned(), self.0.path("bin/cargo"));
+            Checkout::with_cargo(root, cargo.into())
+        }
+
         fn git(&self, args: &[&str]) {
-            let mut git = Command::new("git");
-            git.current_dir(self.0.root()).args([
-                "-c",
-                "user.name=x",
-                "-c",
-                "user.email=x@localhost",
-            ]);
+            let mut git = self.checkout().command("git");
+            git.args(["-c", "user.name=x", "-c", "user.email=x@localhost"]);
             assert!(git.args(args).status().unwrap().success());
         }
 
         fn measure(&self, [base, head]: [&str; 2], rest: &[&str]) -> Result<[PathBuf; 2], Failure> {
-            let (root, cargo) = (self.0.root().to_owned(), self.0.path("bin/cargo"));
-            let checkout = Checkout::with_cargo(root, cargo.into());
+            let checkout = self.checkout();
             let rest: Vec<OsString> = rest.iter().map(OsString::from).collect();
             measure(&checkout, [base.as_ref(), head.as_ref()], "replay".as_ref(), &rest)
         }
@@ -276,6 +296,12 @@ exit 1
             |names, rest: &[&str]| repository.measure(names, rest).unwrap_err().to_string();
         assert!(failed(["one", "HEAD~2"], &[]).contains("one revision"));
         assert!(failed(["one", "never"], &[]).contains("`never` is no revision"));
+        // As after a kill.
+        repository.measure(["one", "two"], &["--rounds", "1"]).unwrap();
+        for worktree in fs::read_dir(repository.0.path(".git/worktrees")).unwrap() {
+            fs::write(worktree.unwrap().path().join("index.lock"), "").unwrap();
+        }
+        repository.measure(["one", "two"], &["--rounds", "1"]).unwrap();
         assert!(failed(["one", "--help"], &[]).contains("`--help` is no revision"));
         assert!(failed(["one", "two"], &["--rounds", "0"]).contains("from 1 to 1000"));
         assert!(failed(["one", "broken"], &[]).contains("`broken` has no results of replay"));

@@ -8,6 +8,7 @@ const FACTOR: f64 = 1.25;
 /// Least differences that a user could notice, in the units of the costs.
 const LEAST_US: f64 = 1.0;
 const LEAST_MB: f64 = 1.0;
+const LEAST_CALL_NS: f64 = 1000.0;
 const LEAST_START_MS: f64 = 10.0;
 const LEAST_RESTARTED_MS: f64 = 1.0;
 const LEAST_KILLED_S: f64 = 0.1;
@@ -109,6 +110,8 @@ impl IsolationCosts {
         let wakes = self.wakes.iter().map(|wake| (wake.name.as_str(), wake.us, LEAST_US));
         let live = self.live_cpu_us.iter().map(|(name, us)| (name.as_str(), *us, LEAST_US));
         let others = [
+            ("host calls", self.host_call_ns, LEAST_CALL_NS),
+            ("memory of the first lambda", self.first_lambda_mb, LEAST_MB),
             ("memory", self.further_lambda_mb, LEAST_MB),
             ("starts", self.start_ms, LEAST_START_MS),
             ("recovery from a fault", self.restarted_ms, LEAST_RESTARTED_MS),
@@ -140,12 +143,12 @@ impl IsolationCosts {
         }
         match (wasm.is_empty(), python.is_empty()) {
             (false, true) => rules.push(
-                "Nothing that was measured favours Python: take it for its libraries, if its costs \
-                 fit."
+                "Nothing that was measured favours Python by a difference that counts: take it for \
+                 its libraries, if its costs fit."
                     .to_owned(),
             ),
             (true, false) => rules.push(
-                "Nothing that was measured favours wasm: take it for code that you do not trust, \
+                "Nothing that was measured favours wasm by a difference that counts: take it for code that you do not trust, \
                  which Python does not confine as well."
                     .to_owned(),
             ),

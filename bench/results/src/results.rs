@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 use crate::figure::Figure;
 use crate::growth::Growth;
 use crate::machine::Machine;
+use crate::statistics::Summary;
 
 /// Version of the format of the JSON file.
 const FORMAT: u32 = 1;
@@ -107,7 +108,7 @@ impl BenchResults {
                 .with_help("choose a folder that can be written: --out DIR")
         };
         fs::create_dir_all(folder).map_err(|error| failed(folder, error))?;
-        let json = serde_json::to_vec(self).expect("results are plain data");
+        let json = serde_json::to_vec(&self.measured()).expect("results are plain data");
         let files =
             [("results.json", json), ("results.md", self.to_markdown().into_bytes())].into_iter();
         for (name, content) in files.chain([("report.html", self.to_html().into_bytes())]) {
@@ -117,8 +118,21 @@ impl BenchResults {
         Ok(())
     }
 
+    /// Returns the results without values that are no numbers, for which JSON has no form.
+    fn measured(&self) -> Self {
+        let mut measured = self.clone();
+        for series in measured.groups.iter_mut().flat_map(|group| &mut group.series) {
+            series.values.retain(|value| value.is_finite());
+        }
+        for curve in measured.growths.iter_mut().flat_map(|growth| &mut growth.curves) {
+            curve.points.retain(|point| point.iter().all(|number| number.is_finite()));
+        }
+        measured
+    }
+
     /// Reads the results in a file or a folder. A folder with a folder for each of several runs has
-    /// the results of all, in the order of their names.
+    /// one value for each run, its median, in the order of their names: values of a run are not
+    /// independent of each other, as the speed of the machine differs between runs.
     ///
     /// # Errors
     ///
@@ -139,8 +153,12 @@ impl BenchResults {
             return Self::read_file(if path.is_dir() { &own } else { path });
         };
         let mut all = Self::read_file(first)?;
+        if !others.is_empty() {
+            all.keep_medians();
+        }
         for run in others {
-            let other = Self::read_file(run)?;
+            let mut other = Self::read_file(run)?;
+            other.keep_medians();
             if (&other.bench, other.is_quick) != (&all.bench, all.is_quick) {
                 let message = format!("`{}` is no run of the same benchmark", run.display());
                 return Err(Failure::new(Exit::Usage, message)
@@ -149,6 +167,17 @@ impl BenchResults {
             all.add_run(other);
         }
         Ok(all)
+    }
+
+    /// Keeps the median of each row and series, as one value.
+    fn keep_medians(&mut self) {
+        for figure in &mut self.figures {
+            let values: Vec<f64> = figure.values.iter().copied().flatten().collect();
+            figure.values = vec![Summary::of(&values).map(|summary| summary.median)];
+        }
+        for series in self.groups.iter_mut().flat_map(|group| &mut group.series) {
+            series.values = Summary::of(&series.values).iter().map(|it| it.median).collect();
+        }
     }
 
     /// Adds the values of another run to the rows and series of the same name.
@@ -210,6 +239,7 @@ impl SeriesGroup {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
+    use crate::growth::GrowthCurve;
     use crate::test_folder::TestFolder;
 
     /// Results with a table and a comparison; `shift` is added to the times of wasm.
@@ -234,6 +264,21 @@ pub(crate) mod tests {
     }
 
     #[test]
+    fn results_with_values_that_were_not_measured_can_be_read() {
+        let folder = TestFolder::new();
+        let mut results = example(0.0);
+        results.groups[0].series[0].values.push(f64::NAN);
+        let points = vec![[1.0, 2.0], [2.0, f64::INFINITY]];
+        let curves = vec![GrowthCurve { name: "wasm".to_owned(), points }];
+        let [name, of, unit] = ["CPU", "lambdas", "%"].map(str::to_owned);
+        results.growths.push(Growth { name, of, unit, curves });
+        results.store(folder.root()).unwrap();
+        let read = BenchResults::read(folder.root()).unwrap();
+        assert_eq!(read.groups[0].series[0].values.len(), 200);
+        assert_eq!(read.growths[0].curves[0].points, [[1.0, 2.0]]);
+    }
+
+    #[test]
     fn several_runs_are_read_as_one() {
         let folder = TestFolder::new();
         let path = folder.path("base");
@@ -244,9 +289,9 @@ pub(crate) mod tests {
         }
         let all = BenchResults::read(&path).unwrap();
         assert_eq!(all.figures.len(), 2);
-        assert_eq!(all.figures[0].values.len(), 6);
+        assert_eq!(all.figures[0].values, [Some(19.0); 2]);
         let wasm = &all.groups[0].series[1].values;
-        assert_eq!((wasm.len(), wasm[0], wasm[200]), (400, 1.5, 2.0));
+        assert!(wasm.len() == 2 && (wasm[1] - wasm[0] - 0.5).abs() < 1e-9, "{wasm:?}");
         other.bench = "scale".to_owned();
         other.store(&path.join("003")).unwrap();
         let error = BenchResults::read(&path).unwrap_err().to_string();

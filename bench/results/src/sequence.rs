@@ -35,7 +35,7 @@ pub enum BenchEnd {
     },
     /// It cannot run here, or was not to run, for this reason.
     Skipped(String),
-    /// It failed: its exit status, and the last line that it printed.
+    /// It failed: its exit status, and its message.
     Failed(String),
 }
 
@@ -62,7 +62,10 @@ impl BenchEnd {
             return Self::Skipped(reason.to_owned());
         }
         let mut words = status.to_owned();
-        if let Some(line) = output.lines().rfind(|line| !line.trim().is_empty()) {
+        // A panic prints its message below its place, and many lines after that.
+        let message = output.lines().skip_while(|line| !line.contains("panicked at")).nth(1);
+        if let Some(line) = message.or_else(|| output.lines().rfind(|line| !line.trim().is_empty()))
+        {
             let _ = write!(words, ": {}", line.trim());
         }
         Self::Failed(words)
@@ -81,6 +84,7 @@ impl SequenceEntry {
         let heads = ["benchmark", "end", "goals met", "s"].map(str::to_owned);
         let rows = entries.iter().map(|entry| {
             let (end, met) = match &entry.end {
+                BenchEnd::Measured { goals: 0, .. } => ("measured", "-".to_owned()),
                 BenchEnd::Measured { goals, missed, .. } => {
                     ("measured", format!("{} of {goals}", goals - missed))
                 }
@@ -136,8 +140,10 @@ mod tests {
         };
         let skipped = read("skipped: no player\n", true);
         assert_eq!(skipped, BenchEnd::Skipped("no player".to_owned()));
-        let failed = read("skipped: a part\npanicked at x\nno Python\n\n", false);
+        let failed = read("skipped: a part\npanicked at x\nno Python\nstack\n 1: x\n\n", false);
         assert_eq!(failed, BenchEnd::Failed("exit status: 101: no Python".to_owned()));
+        let error = read("measuring\nerror: no room\n\n", false);
+        assert_eq!(error, BenchEnd::Failed("exit status: 101: error: no room".to_owned()));
         assert_eq!(read("", false), BenchEnd::Failed("exit status: 101".to_owned()));
         let entry = |bench: &str, end| SequenceEntry { bench: bench.to_owned(), seconds: 1.0, end };
         let text = SequenceEntry::to_markdown(&[entry("rtt", skipped), entry("replay", failed)]);

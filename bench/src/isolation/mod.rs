@@ -62,10 +62,12 @@ pub fn measure(quick: bool, options: &IsolationOptions, results: &mut BenchResul
         match attacks(quick, &mut results.figures) {
             // A quick run compares nothing.
             Ok(counts) => costs.attacks = (counts.compared > 0).then_some(counts),
-            Err(why) => results.notes.push(format!("No attacks were measured: {why}.")),
+            Err(why) => results.notes.push(format!("The attacks are skipped: {why}.")),
         }
     }
-    results.recommendation = costs.recommendation();
+    if !quick {
+        results.recommendation = costs.recommendation();
+    }
 }
 
 /// Runs all attacks, or returns the reason why they cannot be measured.

@@ -115,9 +115,9 @@ impl Load<'_> {
         } else {
             names.iter().map(|name| finished.ended_of(name).expect("it has ended")).collect()
         };
-        let faults: Vec<f64> = ended.iter().map(|live| live.faults as f64).collect();
+        let faults: u64 = ended.iter().map(|live| live.faults).sum();
         let name = format!("{}: wakes that ended in a fault", self.name);
-        figures.push(Figure::at_most(&name, "", 0.0, &faults));
+        figures.push(Figure::at_most(&name, "", 0.0, &[faults as f64]));
         let missing_percent = self.receptions(&ended, &sent, figures);
         let wake_us = self.latencies(&ended, figures);
         let (ingress_percent, all_percent) = self.costs(&first, &last, span, ready_ms, figures);
@@ -150,9 +150,9 @@ impl Load<'_> {
             if granted { "" } else { " (not granted)" }
         );
         figures.push(if granted && !self.is_lossy {
-            Figure::at_most(&name, "samples", 0.0, &missing)
+            Figure::at_most(&name, "samples", 0.0, &[missing.iter().sum()])
         } else {
-            Figure::without_goal(&name, "samples", &missing)
+            Figure::without_goal(&name, "samples", &[missing.iter().sum()])
         });
         self.add("counted as lost or refused", "samples", &refused, figures);
         let expected: u64 =

@@ -8,6 +8,7 @@ mod scale;
 
 use std::fs::{File, TryLockError};
 use std::io;
+use std::os::unix::process::CommandExt;
 use std::path::PathBuf;
 use std::process::{Command, ExitStatus};
 use std::sync::Arc;
@@ -15,9 +16,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::Duration;
 
-use gleaner_tests::live::{no_player, signal};
+use gleaner_tests::live::no_player;
 use gleaner_tests::{namespace, root};
-use signal_hook::consts::{SIGINT, SIGTERM};
+use rustix::process::{Pid, Signal};
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use crate::measure::Twin;
 pub use busy_cores::BusyCores;
@@ -74,14 +76,15 @@ fn start_in_private_network() -> Result<bool, String> {
     status.map(|(status, _)| status.success()).map_err(|error| error.to_string())
 }
 
-/// Runs a command to its end. A signal that asks this program to end is passed on, so that the end
-/// is waited for, and the limit restored. Returns also whether there was such a signal.
+/// Runs a command to its end. A signal that asks this program to end is passed on to the command and
+/// all that it has started, so that nothing goes on without it, the end is waited for, and the limit
+/// restored. Returns also whether there was such a signal.
 pub(crate) fn until_end(command: &mut Command) -> io::Result<(ExitStatus, bool)> {
     let is_asked = Arc::<AtomicBool>::default();
-    for asks in [SIGINT, SIGTERM] {
+    for asks in [SIGHUP, SIGINT, SIGTERM] {
         signal_hook::flag::register(asks, Arc::clone(&is_asked))?;
     }
-    let mut child = command.spawn()?;
+    let mut child = command.process_group(0).spawn()?;
     let mut was_asked = false;
     loop {
         if let Some(status) = child.try_wait()? {
@@ -89,7 +92,9 @@ pub(crate) fn until_end(command: &mut Command) -> io::Result<(ExitStatus, bool)>
         }
         if is_asked.swap(false, Ordering::Relaxed) {
             was_asked = true;
-            signal(child.id(), "TERM");
+            // The group is that of the child, which was not waited for yet.
+            let group = Pid::from_child(&child);
+            let _ = rustix::process::kill_process_group(group, Signal::TERM);
         }
         thread::sleep(Duration::from_millis(100));
     }

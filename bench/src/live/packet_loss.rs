@@ -5,28 +5,26 @@ use std::process::Command;
 /// The table with the rule.
 const TABLE: &str = "gleaner_bench";
 
-/// Drops packets of DDS at random until it is dropped itself.
+/// Drops packets of UDP at random until it is dropped itself.
 pub(super) struct PacketLoss {
     is_set: bool,
 }
 
 impl PacketLoss {
     /// Drops `permille` of 1,000 packets that arrive, of samples and of acknowledgements alike. For
-    /// none, only checks that it is possible; no packet takes another way then.
+    /// none, it has no rule.
     ///
     /// # Errors
     ///
     /// The reason why packets cannot be dropped.
     pub(super) fn of(permille: u32) -> Result<Self, String> {
-        let rule = match permille {
-            0 => "list tables".to_owned(),
-            _ => format!(
+        if permille > 0 {
+            nft(&format!(
                 "add table ip {TABLE}; add chain ip {TABLE} in {{ type filter hook input priority \
-                 0; }}; add rule ip {TABLE} in udp dport 7400-7999 numgen random mod 1000 < \
+                 0; }}; add rule ip {TABLE} in meta l4proto udp numgen random mod 1000 < \
                  {permille} drop"
-            ),
-        };
-        nft(&rule)?;
+            ))?;
+        }
         Ok(Self { is_set: permille > 0 })
     }
 }

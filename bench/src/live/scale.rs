@@ -110,8 +110,8 @@ pub fn loads(quick: bool, options: &ScaleOptions, results: &mut BenchResults) {
             is_flat: false,
             load: Box::new(move |dropped| ScaleLoad { dropped, ..one(lambda, player.clone()) }),
         };
-        if let Err(why) = PacketLoss::of(0) {
-            results.notes.push(format!("loss of packets is not measured: {why}"));
+        if let Err(why) = PacketLoss::of(1) {
+            results.notes.push(format!("Loss of packets is skipped: {why}."));
         } else {
             scales.push(of_loss(
                 "one lambda on an IMU at 1 kHz, with lost packets",
@@ -127,6 +127,10 @@ pub fn loads(quick: bool, options: &ScaleOptions, results: &mut BenchResults) {
     }
     let wanted = scales.iter().filter(|scale| is_wanted(&scale.name));
     wanted.for_each(|scale| scale.measure(seconds, results));
+    if results.figures.is_empty() {
+        let only = options.only.as_deref().unwrap_or_default();
+        results.notes.push(format!("All loads are skipped: none has \"{only}\" in its name."));
+    }
 }
 
 /// Arguments of a player of raw images.

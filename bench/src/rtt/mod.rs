@@ -68,7 +68,7 @@ pub fn measure(quick: bool, options: &RttOptions, results: &mut BenchResults) {
             .to_owned(),
     );
     if !PowerMeter::of_this_machine().is_available() {
-        let note = "Power is not measured: no RAPL and no INA3221 can be read on this machine.";
+        let note = "Power is skipped: no RAPL and no INA3221 can be read on this machine.";
         results.notes.push(note.to_owned());
     }
     let workloads = match &options.workload[..] {

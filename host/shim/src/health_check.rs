@@ -28,7 +28,7 @@ const UNCOUNTED: u64 = 64 << 20;
 /// State of the checks of one process.
 pub(crate) struct HealthCheck {
     pid: u32,
-    /// `None` if the process has ended already, or `/proc` does not show it.
+    /// `None` while it cannot be opened, for example as the system has too many open files.
     status: Option<StatusFile>,
     late: Sustained,
     stopped: Sustained,
@@ -40,7 +40,7 @@ impl HealthCheck {
     pub(crate) fn of(pid: u32) -> Self {
         Self {
             pid,
-            status: StatusFile::open(Some(pid)).ok(),
+            status: None,
             late: Sustained::default(),
             stopped: Sustained::default(),
             excess: Sustained::default(),
@@ -66,6 +66,9 @@ impl HealthCheck {
     /// Checks the process in `/proc`, which the runtime cannot forge.
     fn check_proc(&mut self, pulse: &Pulse) -> Option<Killed> {
         // A process that has just ended has no memory.
+        if self.status.is_none() {
+            self.status = StatusFile::open(Some(self.pid)).ok();
+        }
         let usage = self.status.as_ref()?.usage()?;
         if let Some(stopped) =
             self.stopped.seen(usage.is_stopped).filter(|stopped| *stopped >= MAX_STOPPED)

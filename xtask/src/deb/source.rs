@@ -48,7 +48,7 @@ const VEHICLE: PackageSource = PackageSource {
         ("control-groups.conf", "usr/lib/gleaner/control-groups.conf"),
         ("gleaner-stop", "usr/lib/gleaner/gleaner-stop"),
         ("gleaner.sysusers", "usr/lib/sysusers.d/gleaner.conf"),
-        ("gleaner.sysctl", "usr/lib/sysctl.d/05-gleaner.conf"),
+        ("gleaner.sysctl", "usr/lib/sysctl.d/00-00-gleaner.conf"),
         ("vehicle.toml", "etc/gleaner/vehicle.toml"),
         ("gleaner-orchestrator.8", "usr/share/man/man8/gleaner-orchestrator.8"),
         ("debian/copyright", "usr/share/doc/gleaner/copyright"),

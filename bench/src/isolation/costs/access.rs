@@ -20,6 +20,7 @@ const MEMCPY: &str = "memcpy";
 /// Places of the measured times.
 const NATIVE: usize = 0;
 const WASM: usize = 1;
+const PYTHON: usize = 2;
 
 /// Measured times by the name of their row.
 type Times = BTreeMap<&'static str, Vec<f64>>;
@@ -31,9 +32,8 @@ pub(super) fn measure(
     costs: &mut IsolationCosts,
 ) {
     eprintln!("host calls, columns and frames");
-    let rounds = if quick { 1 } else { 31 };
-    let [native, wasm] = in_this_process(rounds, &mut seed.max(1));
-    let python = in_python(quick);
+    let (blocks, rounds) = if quick { (1, 1) } else { (5, 6) };
+    let [native, wasm, python] = measured(blocks, rounds, &mut seed.max(1));
     let median = |times: &Times, name| times.get(name).and_then(|times| median(times));
     costs.host_call_ns = KindValues {
         native: median(&native, "call"),
@@ -112,8 +112,9 @@ impl<'a> TimedWork<'a> {
     }
 }
 
-/// Measures calls of a component and native ones, in an order by `random` in each round.
-fn in_this_process(rounds: usize, random: &mut u64) -> [Times; 2] {
+/// Measures calls of a component and native ones, in an order by `random` in each round, and those
+/// in Python after each block of rounds.
+fn measured(blocks: u64, rounds: u64, random: &mut u64) -> [Times; 3] {
     let inputs = FilledInputs::new(Vec::new());
     let field = inputs.imu.field("linear_acceleration.x").expect("a field of an IMU");
     let sample = inputs.camera.newest().expect("no holds are refused").expect("a frame");
@@ -138,25 +139,26 @@ fn in_this_process(rounds: usize, random: &mut u64) -> [Times; 2] {
         TimedWork::hosted("copy", 4),
         TimedWork::hosted("copy-luma", 4),
     ];
-    let mut times = [Times::new(), Times::new()];
-    for _ in 0..rounds {
-        for index in shuffled(works.len(), random) {
-            let work = &mut works[index];
-            let us = timed(work.repeated, || (work.run)()).0;
-            times[work.at].entry(work.name).or_default().push(1e3 * us);
+    let mut times = [Times::new(), Times::new(), Times::new()];
+    for _ in 0..blocks {
+        for _ in 0..rounds {
+            for index in shuffled(works.len(), random) {
+                let work = &mut works[index];
+                let us = timed(work.repeated, || (work.run)()).0;
+                times[work.at].entry(work.name).or_default().push(1e3 * us);
+            }
         }
+        in_python(rounds, &mut times[PYTHON]);
     }
     times
 }
 
 /// Replays the lambda that measures itself: a value of each row for each frame.
-fn in_python(quick: bool) -> Times {
+fn in_python(frames: u64, times: &mut Times) {
     let folder = TempFolder::new();
-    let frames = if quick { 1 } else { 31 };
     let topics = ["/imu/data", "/camera/front/image_raw"];
     let drive = drives::with_frames(&folder, topics, COLUMN, frames);
     let run = replay(&root().join("bench/lambdas/access/python"), &[drive], &["--no-record"]);
-    let mut times = Times::new();
     for trigger in run.must_exit(0).decisions.iter().flat_map(|decision| &decision.triggers) {
         let known = ["call", "column", "luma-by-host", "array", "copy", "mean"];
         let name = known.into_iter().find(|name| *name == trigger.label);
@@ -165,5 +167,4 @@ fn in_python(quick: bool) -> Times {
         times.entry(name).or_default().push(ns);
     }
     assert_eq!(run.first_fault(), None);
-    times
 }

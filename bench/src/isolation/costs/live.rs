@@ -48,8 +48,8 @@ pub(super) fn measure(quick: bool, results: &mut BenchResults, costs: &mut Isola
     };
     let mut kinds = [LiveKind::default(), LiveKind::default()];
     let folder = TempFolder::new();
-    // Enough for three statuses, one in a second.
-    let frames = (!quick).then(|| drives::with_frames(&folder, [IMU, CAMERA], 60, 40));
+    // Enough for three statuses, one in a second, also after a stall.
+    let frames = (!quick).then(|| drives::with_frames(&folder, [IMU, CAMERA], 60, 60));
     for _ in 0..rounds {
         for (kind, live) in KINDS.into_iter().zip(&mut kinds) {
             counts.iter().for_each(|count| live.run_imu(kind, *count, length));

@@ -68,7 +68,7 @@ pub(super) fn measure(
                 let place = workload.sides.iter().position(|side| *side == of);
                 place.map(|place| &values[place].medians[index][..])
             };
-            costs.wakes.push(costs_of(&format!("{}, {kind}", workload.name), &group, medians));
+            costs.wakes.push(costs_of(&format!("{}, {kind}", workload.name), medians));
             results.groups.push(group);
         }
         if workload.has_cpu {
@@ -98,17 +98,9 @@ fn group(
     }
 }
 
-/// Takes the medians of a group, and compares a component with one without checks by the medians of
-/// their turns: the speed of the machine differs between turns more than within one.
-fn costs_of<'a>(
-    name: &str,
-    group: &SeriesGroup,
-    of_turns: impl Fn(WakeSide) -> Option<&'a [f64]>,
-) -> WakeCosts {
-    let median = |side: WakeSide| {
-        let found = group.series.iter().find(|series| series.name == side.name());
-        found.and_then(|series| median(&series.values))
-    };
+/// Takes the medians of turns, and compares a component with one without checks by them: the speed of the machine differs between turns more than within one.
+fn costs_of<'a>(name: &str, of_turns: impl Fn(WakeSide) -> Option<&'a [f64]>) -> WakeCosts {
+    let median = |side: WakeSide| of_turns(side).and_then(median);
     let checks = of_turns(WakeSide::UNCHECKED)
         .zip(of_turns(WakeSide::WASM))
         .and_then(|(unchecked, wasm)| MeasuredDifference::between(unchecked, wasm));
