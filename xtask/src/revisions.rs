@@ -252,7 +252,7 @@ exit 1
             measure(&checkout, [base.as_ref(), head.as_ref()], "replay".as_ref(), &rest)
         }
 
-        /// What cargo was started for: the revision, and its arguments up to the folder.
+        /// The calls of cargo: the revision, and its arguments up to the folder.
         fn calls(&self) -> Vec<String> {
             let calls = fs::read_to_string(self.0.path("bin/calls")).unwrap();
             let call = |line: &str| line.split(" --out").next().unwrap().to_owned();

@@ -1,7 +1,8 @@
 //! The parts that a sample passes on its way into a lambda, one by one: `cargo xtask bench parts`.
 //!
-//! Each is measured alone, in a loop, with its data in the cache. So the numbers compare two versions
-//! of a part; they are no latencies of a vehicle.
+//! Each is measured alone, in a loop, with its data in the cache. So the numbers compare two
+//! versions of a part; they are no latencies of a vehicle.
+#![allow(unsafe_code)]
 
 use bench_kernels::Work;
 use divan::counter::BytesCount;
@@ -43,7 +44,6 @@ fn publish_own(writer: &mut RingWriter<u64>, value: u64) {
 }
 
 /// A ring in shared memory, as the ingress has it, with samples of an IMU.
-#[allow(unsafe_code)]
 fn shared_ring() -> (SharedWriter, SharedReader) {
     let limits = HoldLimits { first_word: 0, windows: 2, window: WINDOW as u16, singles: 2 };
     let depth = 512;

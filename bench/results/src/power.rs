@@ -79,8 +79,8 @@ impl PowerMeter {
         !self.counters.is_empty() || !self.rails.is_empty()
     }
 
-    /// Waits for `time`, and calls `look` with the elapsed time now and then. Returns the mean power
-    /// meanwhile of each part that has a sensor, in W.
+    /// Waits for `time`, and calls `look` with the elapsed time now and then. Returns the mean
+    /// power meanwhile of each part that has a sensor, in W.
     pub fn watch(&self, time: Duration, mut look: impl FnMut(Duration)) -> Vec<(String, f64)> {
         let began = Instant::now();
         let energy = || -> Vec<Option<u64>> {

@@ -76,9 +76,9 @@ fn start_in_private_network() -> Result<bool, String> {
     status.map(|(status, _)| status.success()).map_err(|error| error.to_string())
 }
 
-/// Runs a command to its end. A signal that asks this program to end is passed on to the command and
-/// all that it has started, so that nothing goes on without it, the end is waited for, and the limit
-/// restored. Returns also whether there was such a signal.
+/// Runs a command to its end. A signal that asks this program to end is passed on to the command
+/// and all that it has started, so that nothing goes on without it, the end is waited for, and the
+/// limit restored. Returns also whether there was such a signal.
 pub(crate) fn until_end(command: &mut Command) -> io::Result<(ExitStatus, bool)> {
     let is_asked = Arc::<AtomicBool>::default();
     for asks in [SIGHUP, SIGINT, SIGTERM] {

@@ -190,7 +190,7 @@ impl ScaleLoad {
     }
 }
 
-/// What a scale measures: name, unit and value.
+/// A quantity that a scale measures: name, unit and value.
 type Measured = (&'static str, &'static str, fn(&LoadCosts) -> f64);
 
 const MEASURED: [Measured; 5] = [

@@ -65,8 +65,8 @@ impl ProcessUsage {
     }
 }
 
-/// The open file `status` of a process, which can be read again and again. A check of the shim takes
-/// 83 us with it; it took 148 us when it opened this file and that of the limits each time.
+/// The open file `status` of a process, which can be read again and again. A check of the shim
+/// takes 83 us with it; it took 148 us when it opened this file and that of the limits each time.
 #[derive(Debug)]
 pub struct StatusFile(File);
 

@@ -98,7 +98,8 @@ fn group(
     }
 }
 
-/// Takes the medians of turns, and compares a component with one without checks by them: the speed of the machine differs between turns more than within one.
+/// Takes the medians of turns, and compares a component with one without checks by them: the
+/// speed of the machine differs between turns more than within one.
 fn costs_of<'a>(name: &str, of_turns: impl Fn(WakeSide) -> Option<&'a [f64]>) -> WakeCosts {
     let median = |side: WakeSide| of_turns(side).and_then(median);
     let checks = of_turns(WakeSide::UNCHECKED)
