@@ -14,7 +14,7 @@ use crate::steps;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct GlibcVersion(u32, u32);
 
-/// That of Ubuntu 22.04, and with it of JetPack 6.
+/// The version of Ubuntu 22.04, and with it of JetPack 6.
 pub(crate) const OF_JETPACK: GlibcVersion = GlibcVersion(2, 35);
 
 /// The versions that a file needs, with the symbols of each.

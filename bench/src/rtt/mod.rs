@@ -67,7 +67,8 @@ pub fn measure(quick: bool, options: &RttOptions, results: &mut BenchResults) {
          the stamp of the answer, just before it is sent."
             .to_owned(),
     );
-    if !PowerMeter::of_this_machine().is_available() {
+    let meter = PowerMeter::of_this_machine();
+    if !meter.is_available() {
         let note = "Power is skipped: no RAPL and no INA3221 can be read on this machine.";
         results.notes.push(note.to_owned());
     }
@@ -94,7 +95,7 @@ pub fn measure(quick: bool, options: &RttOptions, results: &mut BenchResults) {
                 results.notes.push(format!("{name} is skipped: no busy cores: {error}"));
                 continue;
             }
-            compare(workload, name, granted, &options, results);
+            compare(workload, name, granted, &options, &meter, results);
         }
     }
 }
@@ -105,6 +106,7 @@ fn compare(
     name: String,
     granted: u64,
     options: &RttOptions,
+    meter: &PowerMeter,
     results: &mut BenchResults,
 ) {
     let mut dds = Dds::open(DdsOptions::new("/gleaner_bench/answers")).expect("a private network");
@@ -112,12 +114,11 @@ fn compare(
     let mut sides = workload.sides(granted);
     let mut turns: BTreeMap<usize, Vec<Turn>> = BTreeMap::new();
     let mut random = options.seed.max(1);
-    let meter = PowerMeter::of_this_machine();
     let mut memory = Vec::new();
     for _ in 0..options.turns {
         for index in shuffled(sides.len(), &mut random) {
             let seconds = [options.warm_up, options.turn];
-            match sides[index].turn(workload, &answers, &meter, seconds) {
+            match sides[index].turn(workload, &answers, meter, seconds) {
                 Ok(turn) => turns.entry(index).or_default().push(turn),
                 Err(why) => {
                     let note = format!("{}: skipped: {why}", sides[index].name());

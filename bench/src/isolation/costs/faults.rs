@@ -5,10 +5,10 @@ use std::path::Path;
 
 use gleaner_bench_results::{BenchResults, IsolationCosts, KindValues, Series, SeriesGroup};
 use gleaner_lambda::{Decision, FaultKind};
-use gleaner_protocol::Report;
 use gleaner_tests::live::{decisions, run_all};
 use gleaner_tests::{LambdaCopy, TempFolder, replay, sample_drive};
 
+use super::live::until_all;
 use crate::measure::{Twin, median};
 
 const TRAP: &str = "wasm: trap";
@@ -103,16 +103,7 @@ fn live(faults: u64) -> [Vec<Decision>; 2] {
     let (out, drive) = (TempFolder::new(), sample_drive());
     let drive = drive.to_str().expect("a plain name");
     let started = run_all(&folders, out.path(), &["--no-record", "--all", "--drive", drive]);
-    let mut done = Vec::new();
-    started.until_named("faults by deadlines", |name, report| {
-        if let Report::Live(live) = report
-            && live.faults >= faults
-            && !done.contains(&name)
-        {
-            done.push(name);
-        }
-        (done.len() == LIVE.len()).then_some(())
-    });
+    until_all(&started, "faults by deadlines", LIVE.len(), |live| live.faults >= faults);
     started.signal("INT");
     started.finish();
     LIVE.map(|(_, twin)| decisions(&out.path().join(twin.folder())))

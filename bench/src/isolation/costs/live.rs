@@ -7,7 +7,7 @@ use std::time::Instant;
 use gleaner_bench_results::{
     BenchResults, Growth, GrowthCurve, IsolationCosts, KindValues, Series, SeriesGroup,
 };
-use gleaner_protocol::Report;
+use gleaner_protocol::{LiveStatus, Report};
 use gleaner_tests::live::{RunningProgram, run_all};
 use gleaner_tests::{LambdaCopy, TempFolder, sample_drive};
 use rustix::process::{Pid, Signal, kill_process};
@@ -136,7 +136,8 @@ impl LiveKind {
         if count == 1 {
             self.imu_cpu_us.extend(cpu_per_wake(&started, length));
         } else {
-            until_all_warm(&started, count, length.warm_up);
+            let is_warm = |live: &LiveStatus| live.wakes >= length.warm_up;
+            until_all(&started, "the first spectra of all", count, is_warm);
         }
         let processes = LiveProcesses::of(&started);
         let memory = processes.shims.iter().chain(&processes.lambdas).map(|pid| pss_mib(*pid));
@@ -186,21 +187,27 @@ fn cpu_per_wake(started: &RunningProgram, length: LiveLength) -> Vec<f64> {
     (1..statuses).map(between).collect()
 }
 
-fn until_all_warm(started: &RunningProgram, count: usize, warm_up: u64) {
-    let mut warm = Vec::new();
-    started.until_named("the first spectra of all", |name, report| {
+/// Waits until `count` lambdas of a run have each reported a status that `is_reached` accepts.
+pub(super) fn until_all(
+    started: &RunningProgram,
+    what: &str,
+    count: usize,
+    is_reached: impl Fn(&LiveStatus) -> bool,
+) {
+    let mut reached = Vec::new();
+    started.until_named(what, |name, report| {
         if let Report::Live(live) = report
-            && live.wakes >= warm_up
-            && !warm.contains(&name)
+            && is_reached(&live)
+            && !reached.contains(&name)
         {
-            warm.push(name);
+            reached.push(name);
         }
-        (warm.len() == count).then_some(())
+        (reached.len() == count).then_some(())
     });
 }
 
 /// Kills a lambda's process; returns the time until the `init` of the next one has returned, in s.
-/// That one answers the samples of the meantime first.
+/// The new process answers the samples of the meantime first.
 fn until_replaced(lambda: u32, started: &RunningProgram) -> f64 {
     let pid = i32::try_from(lambda).ok().and_then(Pid::from_raw).expect("a process id");
     let killed = Instant::now();
