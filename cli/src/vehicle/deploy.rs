@@ -135,15 +135,25 @@ impl LocalRevision {
             revisions: vec![self.envelope.clone()],
             waves: args.waves.plan(),
         };
-        let (mut sent, mut rounds) = (0, 0);
+        let (mut sent, mut rounds, mut failed) = (0, 0, None);
         let attempt = loop {
             match client.create("/v1/deployments", &request)? {
                 DeployReply::Accepted { attempt, .. } => break attempt,
                 DeployReply::Missing { objects } if rounds < ROUNDS => {
-                    objects.iter().try_for_each(|object| self.send(client, object))?;
+                    // Another deployment of this id may have brought the file meanwhile: then it
+                    // is refused, and not missing any more.
+                    match objects.iter().try_for_each(|object| self.send(client, object)) {
+                        Err(it) if !matches!(it.exit, Exit::Usage | Exit::Unreachable) => {
+                            return Err(it);
+                        }
+                        done => failed = done.err(),
+                    }
                     (sent, rounds) = (sent.max(objects.len()), rounds + 1);
                 }
                 DeployReply::Missing { objects } => {
+                    if let Some(failure) = failed {
+                        return Err(failure);
+                    }
                     let (receiver, count) =
                         (client.receiver(), counted(objects.len() as u64, "file"));
                     let message = format!("{receiver} lacks {count} although all were sent");

@@ -212,8 +212,9 @@ impl Reconciler {
                         let digest: Sha256 = object.sha256.parse().map_err(|error| {
                             Failure::caused_by(Exit::Internal, "a digest is invalid", &error)
                         })?;
-                        let (length, target) =
-                            (self.core.expected(&digest)?, self.core.store.object(&digest));
+                        // A user may have deployed the same files meanwhile.
+                        let Ok(length) = self.core.expected(&digest) else { break };
+                        let target = self.core.store.object(&digest);
                         Download { http, sha256: &digest, length, target }.run().await?;
                     }
                 }
