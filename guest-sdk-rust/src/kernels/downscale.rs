@@ -4,10 +4,15 @@
 //! pixel has `to` of them, a new one `from`, and the weight of an old pixel in a new one is the
 //! number of pieces that they share. So the result is an exact fraction, rounded once.
 
+use std::array;
+
 use super::{Colours, Image, ImageError};
 
 /// Bytes of a row that one iteration of the loop weights.
 const TURN: usize = 64;
+
+/// Pixels of a row that one iteration of the loop adds up.
+const PIXELS: usize = 16;
 
 /// Returns the number of bytes that [`downscale`] of `image` to `width` x `height` writes: three
 /// per pixel of a coloured image, one per pixel of a grey one.
@@ -31,7 +36,8 @@ pub fn downscaled(image: &Image<'_>, width: u32, height: u32) -> Result<usize, I
 /// [`Frame::resize`](crate::Frame::resize) where no side grows.
 ///
 /// A new pixel is the mean of the area that it covers, computed exactly and rounded to nearest
-/// (halves up). Allocates 4 bytes for each byte in a row of the old image.
+/// (halves up). Allocates 12 bytes for each byte in a row of the old image, and 8 for each pixel in a
+/// row of the new one.
 ///
 /// # Errors
 ///
@@ -49,19 +55,20 @@ pub fn downscale(
     let across = Axis::new(image.width(), width);
     let down = Axis::new(image.height(), height);
     let rounded = RoundedDivision::to(u64::from(down.from) * u64::from(across.from));
+    let edges: Vec<Edge> = (0..=width).map(|x| across.edge(x)).collect();
     let mut columns = vec![0_u32; image.width * image.pixel()];
+    let mut sums = vec![0_u64; columns.len() + 2 * image.pixel()];
     for (y, line) in (0..height).zip(out.chunks_exact_mut(width as usize * image.pixel())) {
         let taps = down.taps(y);
         columns.fill(0);
         for (source, row) in (taps.first..=taps.last).zip(image.rows_from(taps.first as usize)) {
             add_weighted(row, down.weight(taps, source), &mut columns);
         }
+        let row = Row { columns: &columns, sums: &mut sums, edges: &edges, across, rounded };
         match image.colours {
-            Colours::Grey => blend(&columns, across, rounded, line, |[grey]| [grey]),
-            Colours::Rgb => blend(&columns, across, rounded, line, |rgb: [u8; 3]| rgb),
-            Colours::Bgr => {
-                blend(&columns, across, rounded, line, |[blue, green, red]| [red, green, blue])
-            }
+            Colours::Grey => row.blend(line, |[grey]| [grey]),
+            Colours::Rgb => row.blend(line, |rgb: [u8; 3]| rgb),
+            Colours::Bgr => row.blend(line, |[blue, green, red]| [red, green, blue]),
         }
     }
     Ok(())
@@ -84,29 +91,58 @@ fn add_weighted(row: &[u8], weight: u32, columns: &mut [u32]) {
     }
 }
 
-/// Writes a row of pixels of `N` bytes from `columns`; `arrange` reorders the bytes of a pixel.
-fn blend<const N: usize>(
-    columns: &[u32],
+/// A row of old pixels that becomes one of new pixels.
+struct Row<'a> {
+    columns: &'a [u32],
+    /// Place for the sums of all old pixels before each one, and one more.
+    sums: &'a mut [u64],
+    edges: &'a [Edge],
     across: Axis,
     rounded: RoundedDivision,
-    line: &mut [u8],
-    arrange: impl Fn([u8; N]) -> [u8; N],
-) {
-    let columns = columns.as_chunks::<N>().0;
-    for (x, pixel) in (0..).zip(line.as_chunks_mut::<N>().0) {
-        let taps = across.taps(x);
-        let mut sums = [0_u64; N];
-        for (source, values) in
-            (taps.first..).zip(&columns[taps.first as usize..=taps.last as usize])
-        {
-            let weight = u64::from(across.weight(taps, source));
-            for (sum, value) in sums.iter_mut().zip(values) {
-                // Below 2^16 * 2^24.
-                *sum += weight * u64::from(*value);
-            }
+}
+
+impl Row<'_> {
+    /// Writes new pixels of `N` bytes; `arrange` reorders the bytes of a pixel.
+    ///
+    /// The sum of a new pixel is the difference of the sums before its two edges, so that the
+    /// number of its old pixels decides no branch.
+    fn blend<const N: usize>(self, line: &mut [u8], arrange: impl Fn([u8; N]) -> [u8; N]) {
+        let columns = self.columns.as_chunks::<N>().0;
+        let sums = self.sums.as_chunks_mut::<N>().0;
+        add_up(columns, &mut sums[1..=columns.len()]);
+        let scale = u64::from(self.across.to);
+        let before = |edge: &Edge| {
+            let [sum, next] = [sums[edge.pixel as usize], sums[edge.pixel as usize + 1]];
+            let part = u64::from(edge.pieces);
+            // Below 2^16 pieces of 2^16 pixels of 2^24; checks would only take time.
+            array::from_fn(|at| {
+                let pixel = next[at].wrapping_sub(sum[at]);
+                scale.wrapping_mul(sum[at]).wrapping_add(part.wrapping_mul(pixel))
+            })
+        };
+        let mut left: [u64; N] = [0; N];
+        for (edge, pixel) in self.edges[1..].iter().zip(line.as_chunks_mut::<N>().0) {
+            let right = before(edge);
+            *pixel =
+                arrange(array::from_fn(|at| self.rounded.divide(right[at].wrapping_sub(left[at]))));
+            left = right;
         }
-        *pixel = arrange(sums.map(|sum| rounded.divide(sum)));
     }
+}
+
+/// Writes the sum of all columns up to each one.
+fn add_up<const N: usize>(columns: &[[u32; N]], sums: &mut [[u64; N]]) {
+    let mut total = [0_u64; N];
+    let mut add = |(sum, column): (&mut [u64; N], &[u32; N])| {
+        *sum = array::from_fn(|at| total[at].wrapping_add(u64::from(column[at])));
+        total = *sum;
+    };
+    let (turns, rest) = columns.as_chunks::<PIXELS>();
+    let (sum_turns, sum_rest) = sums.as_chunks_mut::<PIXELS>();
+    for (sums, columns) in sum_turns.iter_mut().zip(turns) {
+        sums.iter_mut().zip(columns).for_each(&mut add);
+    }
+    sum_rest.iter_mut().zip(rest).for_each(&mut add);
 }
 
 /// An axis of an image and its new length, as a fraction in lowest terms.
@@ -125,6 +161,13 @@ struct Taps {
     tail: u32,
 }
 
+/// The left edge of a new pixel: an old pixel, and the pieces of it before the edge.
+#[derive(Clone, Copy)]
+struct Edge {
+    pixel: u32,
+    pieces: u32,
+}
+
 impl Axis {
     fn new(from: u32, to: u32) -> Self {
         let (mut divisor, mut rest) = (from, to);
@@ -141,6 +184,12 @@ impl Axis {
         let (start, end) = (at * from, (at + 1) * from);
         let (first, last) = (start / to, (end - 1) / to);
         Taps { first, last, head: end.min((first + 1) * to) - start, tail: end - last * to }
+    }
+
+    /// Returns the left edge of new pixel `at`.
+    fn edge(self, at: u32) -> Edge {
+        let pieces = at * self.from;
+        Edge { pixel: pieces / self.to, pieces: pieces % self.to }
     }
 
     fn weight(self, taps: Taps, source: u32) -> u32 {
@@ -178,7 +227,8 @@ impl RoundedDivision {
     fn divide(self, sum: u64) -> u8 {
         let sum = sum + self.total / 2;
         match self.factor {
-            Some(factor) => ((sum * factor) >> Self::SHIFT) as u8,
+            // A check would multiply with 128 bits, by a call in a component.
+            Some(factor) => (sum.wrapping_mul(factor) >> Self::SHIFT) as u8,
             None => (sum / self.total) as u8,
         }
     }
