@@ -11,6 +11,7 @@ use gleaner_tests::{LambdaCopy, TempFolder};
 
 use super::ANSWERS;
 use super::bare::BareReader;
+use super::core_split::CoreSplit;
 use super::node::NodeSide;
 use super::workload::Workload;
 use crate::answers::{RttAnswer, RttReceiver};
@@ -32,6 +33,8 @@ pub(super) enum Side {
 
 /// A lambda, and its status at the end of the last turn.
 pub(super) struct LambdaSide {
+    /// Name among the lambdas of its workload.
+    pub(super) name: String,
     pub(super) kind: Twin,
     pub(super) lambda: LambdaCopy,
     pub(super) last: Option<LiveStatus>,
@@ -69,7 +72,7 @@ impl Side {
     pub(super) fn name(&self) -> String {
         match self {
             Self::Bare => Self::BARE.to_owned(),
-            Self::Lambda(side) => format!("lambda, {}", side.kind),
+            Self::Lambda(side) => format!("lambda, {}", side.name),
             Self::Node(side) => side.name().to_owned(),
         }
     }
@@ -83,10 +86,10 @@ impl Side {
         &mut self,
         workload: Workload,
         answers: &RttReceiver,
-        meter: &PowerMeter,
+        (split, meter): (&CoreSplit, &PowerMeter),
         [warm_up, measured]: [u32; 2],
     ) -> Result<Turn, String> {
-        let (running, mut facts) = self.start(workload)?;
+        let (running, mut facts) = split.for_side(|| self.start(workload))?;
         answers.take();
         let duration = (warm_up + measured).to_string();
         let is_alone = matches!(self, Self::Bare);
@@ -189,7 +192,7 @@ impl Side {
             for (share, ns, goal) in
                 [("p50", stats.p50_ns, goals[0]), ("p99", stats.p99_ns, goals[1])]
             {
-                let name = format!("{group}, {}: {what}, {share}", side.kind);
+                let name = format!("{group}, {}: {what}, {share}", side.name);
                 let us = [ns as f64 / 1e3];
                 figures.push(if has_goal && !workload.is_of_images() {
                     Figure::at_most(&name, "us", goal, &us)

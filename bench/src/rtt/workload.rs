@@ -93,29 +93,41 @@ impl Workload {
 
     /// Returns all sides. `buffer` is the limit of socket buffers.
     pub(super) fn sides(self, buffer: u64) -> Vec<Side> {
-        let lambdas = [Twin::Rust, Twin::Python].map(|kind| {
-            Side::Lambda(Box::new(LambdaSide { kind, lambda: self.lambda(kind), last: None }))
+        let lambda = |name: &str, kind, lambda| {
+            Side::Lambda(Box::new(LambdaSide { name: name.to_owned(), kind, lambda, last: None }))
+        };
+        let twins = [Twin::Rust, Twin::Python]
+            .map(|kind| lambda(&kind.to_string(), kind, self.lambda(kind)));
+        // The same decision where the lambda computes what the host does otherwise.
+        let by_kernel = self.is_of_images().then(|| {
+            let copy = copy_on_player("bench/lambdas/brake-dark-kernel/rust");
+            lambda("wasm, SDK kernel", Twin::Rust, copy)
         });
         let nodes = [NodeKind::StandIn, NodeKind::Rclpy, NodeKind::RclpyKeepingMemory];
         let nodes = nodes.map(|kind| Side::Node(NodeSide { kind, buffer }));
-        [Side::Bare].into_iter().chain(lambdas).chain(nodes).collect()
+        [Side::Bare].into_iter().chain(twins).chain(by_kernel).chain(nodes).collect()
     }
 
-    /// Returns a copy of the lambda, on the topics of the player. It looks at each image: at rest,
-    /// too, a car brakes by less than 100 m/s^2.
+    /// Returns a copy of the lambda, on the topics of the player.
     pub(crate) fn lambda(self, kind: Twin) -> LambdaCopy {
         let folder = match self {
             Self::Empty | Self::EmptyAwake => "bench/lambdas/imu",
             Self::ImuFft => "examples/imu-fft",
             Self::Brake720 | Self::Brake1080 => "examples/brake-dark",
         };
-        LambdaCopy::of(&format!("{folder}/{}", kind.folder()), |manifest| {
-            manifest
-                .replace("/camera/front/compressed", "/camera/synthetic/image_raw")
-                .replace("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
-                .replace("/imu/data", "/imu/synthetic")
-                .replace("max_size = \"2 MiB\"", "max_size = \"8 MiB\"")
-                .replace("default = -3.0", "default = 100.0")
-        })
+        copy_on_player(&format!("{folder}/{}", kind.folder()))
     }
+}
+
+/// Returns a copy of a lambda, on the topics of the player. It looks at each image: at rest, too, a
+/// car brakes by less than 100 m/s^2.
+fn copy_on_player(folder: &str) -> LambdaCopy {
+    LambdaCopy::of(folder, |manifest| {
+        manifest
+            .replace("/camera/front/compressed", "/camera/synthetic/image_raw")
+            .replace("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
+            .replace("/imu/data", "/imu/synthetic")
+            .replace("max_size = \"2 MiB\"", "max_size = \"8 MiB\"")
+            .replace("default = -3.0", "default = 100.0")
+    })
 }
