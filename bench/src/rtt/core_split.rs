@@ -47,8 +47,8 @@ impl CoreSplit {
         let Self { all, sides, others } = self;
         let shared = if all == others { ", as there are no others" } else { "" };
         format!(
-            "All processes of the sides run on cores {sides} (`--cpus`), sender and recorder on \
-             cores {others}{shared}."
+            "Cores (`--cpus`): {sides} for all processes of the sides, {others} for the sender and \
+             the recorder{shared}."
         )
     }
 

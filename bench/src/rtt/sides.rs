@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 
 use gleaner_bench_results::{Figure, PowerMeter};
 use gleaner_protocol::LiveStatus;
+use gleaner_protocol::inference::InferenceReport;
 use gleaner_tests::live::{PATIENCE, RunningProgram, cpu_ns, descendants, play, run};
 use gleaner_tests::{LambdaCopy, TempFolder};
 
@@ -73,7 +74,7 @@ impl Side {
         match self {
             Self::Bare => Self::BARE.to_owned(),
             Self::Lambda(side) => format!("lambda, {}", side.name),
-            Self::Node(side) => side.name().to_owned(),
+            Self::Node(side) => side.name(),
         }
     }
 
@@ -159,7 +160,10 @@ impl Side {
             RunningSide::Bare(reader) => reader.stop(),
             RunningSide::Lambda(started, _out) => {
                 started.signal("INT");
-                let live = started.finish().ended();
+                let finished = started.finish();
+                let runtime = finished.lines.iter().find_map(|line| model_runtime(line));
+                facts.extend(runtime.map(|runtime| ("model".to_owned(), runtime)));
+                let live = finished.ended();
                 let granted = live.network.buffer_granted;
                 facts.insert("socket buffer, B".to_owned(), granted.to_string());
                 if let Self::Lambda(side) = self {
@@ -226,6 +230,14 @@ impl RunningSide {
         let processes = self.processes();
         let mib = (!processes.is_empty()).then(|| processes.into_iter().map(pss_mib).sum::<f64>());
         mib.filter(|mib| mib.is_finite()).map(|mib| mib * f64::from(1 << 20) / 1e6)
+    }
+}
+
+/// Returns what ran the model of a lambda, if a line is the last report of its process.
+fn model_runtime(line: &str) -> Option<String> {
+    match serde_json::from_str(line) {
+        Ok(InferenceReport::Ended(status)) => Some(status.models.first()?.runtime.clone()),
+        _ => None,
     }
 }
 

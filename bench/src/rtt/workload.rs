@@ -23,11 +23,19 @@ pub(crate) enum Workload {
     Brake720,
     /// Raw images of 1920x1080 at 10 Hz.
     Brake1080,
+    /// Raw images of 1920x1080 at 30 Hz: `examples/yolo-detector`.
+    Detector,
 }
 
 impl Workload {
-    pub(super) const ALL: [Self; 5] =
-        [Self::Empty, Self::EmptyAwake, Self::ImuFft, Self::Brake720, Self::Brake1080];
+    pub(super) const ALL: [Self; 6] = [
+        Self::Empty,
+        Self::EmptyAwake,
+        Self::ImuFft,
+        Self::Brake720,
+        Self::Brake1080,
+        Self::Detector,
+    ];
 
     /// Returns its title, with the limit of socket buffers.
     pub(super) fn title(self, buffer: u64) -> String {
@@ -37,6 +45,7 @@ impl Workload {
             Self::ImuFft => "IMU at 100 Hz, FFT",
             Self::Brake720 => "720p at 10 Hz, Brake + Dark",
             Self::Brake1080 => "1080p at 10 Hz, Brake + Dark",
+            Self::Detector => "1080p at 30 Hz, detector",
         };
         // Powers of two are written by people in MiB, the usual limit of Linux in bytes.
         match buffer {
@@ -49,12 +58,20 @@ impl Workload {
     }
 
     /// Returns the limits of socket buffers to measure with; `None` leaves the one that there is.
-    /// An IMU fits in any.
+    /// An IMU fits in any. What a detector skips is not to be the loss of a small buffer.
     pub(super) fn buffers(self) -> Vec<Option<u64>> {
-        if self.is_of_images() { BUFFERS.map(Some).to_vec() } else { vec![None] }
+        match self {
+            Self::Empty | Self::EmptyAwake | Self::ImuFft => vec![None],
+            Self::Brake720 | Self::Brake1080 => BUFFERS.map(Some).to_vec(),
+            Self::Detector => vec![BUFFERS.last().copied()],
+        }
     }
 
     pub(super) fn is_of_images(self) -> bool {
+        self.is_brake_dark() || self == Self::Detector
+    }
+
+    fn is_brake_dark(self) -> bool {
         matches!(self, Self::Brake720 | Self::Brake1080)
     }
 
@@ -76,10 +93,11 @@ impl Workload {
         let camera = match self {
             Self::Brake720 => &["--synthetic", "1280x720@10"][..],
             Self::Brake1080 => &["--synthetic", "1920x1080@10"],
-            _ => &[],
+            Self::Detector => &["--synthetic", "1920x1080@30"],
+            Self::Empty | Self::EmptyAwake | Self::ImuFft => &[],
         };
-        let imu = if self.is_of_images() && is_alone { &[][..] } else { &["--imu", "100"] };
-        [camera, imu].concat()
+        let has_imu = camera.is_empty() || self.is_brake_dark() && !is_alone;
+        [camera, if has_imu { &["--imu", "100"] } else { &[] }].concat()
     }
 
     /// Returns the name of the workload in a baseline, and its configuration.
@@ -88,6 +106,7 @@ impl Workload {
             Self::Empty | Self::EmptyAwake => ("empty", &[]),
             Self::ImuFft => ("imu-fft", &[]),
             Self::Brake720 | Self::Brake1080 => ("brake-dark", &["brake_mps2=100"]),
+            Self::Detector => ("yolo-detector", &[]),
         }
     }
 
@@ -99,12 +118,19 @@ impl Workload {
         let twins = [Twin::Rust, Twin::Python]
             .map(|kind| lambda(&kind.to_string(), kind, self.lambda(kind)));
         // The same decision where the lambda computes what the host does otherwise.
-        let by_kernel = self.is_of_images().then(|| {
+        let by_kernel = self.is_brake_dark().then(|| {
             let copy = copy_on_player("bench/lambdas/brake-dark-kernel/rust");
             lambda("wasm, SDK kernel", Twin::Rust, copy)
         });
-        let nodes = [NodeKind::StandIn, NodeKind::Rclpy, NodeKind::RclpyKeepingMemory];
-        let nodes = nodes.map(|kind| Side::Node(NodeSide { kind, buffer }));
+        let [stand_in, rclpy] = [NodeKind::StandIn, NodeKind::Rclpy];
+        let usual = NodeSide::DEPTH;
+        let nodes = match self {
+            // A node that is slower than its camera answers old images, or with depth 1 new ones.
+            Self::Detector => vec![(stand_in, usual), (stand_in, 1), (rclpy, usual), (rclpy, 1)],
+            _ => [stand_in, rclpy, NodeKind::RclpyKeepingMemory].map(|kind| (kind, usual)).to_vec(),
+        };
+        let nodes =
+            nodes.into_iter().map(|(kind, depth)| Side::Node(NodeSide { kind, depth, buffer }));
         [Side::Bare].into_iter().chain(twins).chain(by_kernel).chain(nodes).collect()
     }
 
@@ -114,6 +140,7 @@ impl Workload {
             Self::Empty | Self::EmptyAwake => "bench/lambdas/imu",
             Self::ImuFft => "examples/imu-fft",
             Self::Brake720 | Self::Brake1080 => "examples/brake-dark",
+            Self::Detector => "examples/yolo-detector",
         };
         copy_on_player(&format!("{folder}/{}", kind.folder()))
     }
