@@ -92,10 +92,10 @@ impl Side {
     ) -> Result<Turn, String> {
         let (running, mut facts) = split.for_side(|| self.start(workload))?;
         answers.take();
-        let duration = (warm_up + measured).to_string();
-        let is_alone = matches!(self, Self::Bare);
-        let player = ["--stamp", "monotonic", "--wait", "1", "--duration", &duration];
-        let player = play(&[&workload.player(is_alone)[..], &player].concat());
+        let player = workload.player(matches!(self, Self::Bare), warm_up + measured);
+        let mut arguments = vec!["--stamp", "monotonic", "--wait", "1"];
+        arguments.extend(player.iter().map(String::as_str));
+        let player = play(&arguments);
         let mut received = first(answers, &self.name());
         sleep(Duration::from_secs(warm_up.into()));
         let (before, began) = (running.cpu_ns(), Instant::now());
@@ -110,6 +110,9 @@ impl Side {
         let cpu = running.cpu_ns().zip(before).map(|(after, before)| after.saturating_sub(before));
         let span = began.elapsed();
         let memory_mb = memory.last().map(|[_, mb]| *mb);
+        if workload.is_looped() {
+            player.signal("INT");
+        }
         let played = player.finish();
         let sent = played.sent()[workload.event().0];
         // The last answers may still be on their way.

@@ -1,7 +1,7 @@
 //! Workloads: the inputs, and the sides that answer them.
 
 use clap::ValueEnum;
-use gleaner_tests::LambdaCopy;
+use gleaner_tests::{LambdaCopy, sample_drive};
 
 use super::node::{NodeKind, NodeSide};
 use super::sides::{LambdaSide, Side};
@@ -23,7 +23,7 @@ pub(crate) enum Workload {
     Brake720,
     /// Raw images of 1920x1080 at 10 Hz.
     Brake1080,
-    /// Raw images of 1920x1080 at 30 Hz: `examples/yolo-detector`.
+    /// Images of a drive, raw, as 1920x1080 at 30 Hz: `examples/yolo-detector`.
     Detector,
 }
 
@@ -88,16 +88,34 @@ impl Workload {
         }
     }
 
-    /// Returns the arguments of the player: those for the event alone, or for all inputs.
-    pub(super) fn player(self, is_alone: bool) -> Vec<&'static str> {
+    /// Returns the arguments of the player: those for the event alone, or for all inputs. Unless the
+    /// workload is [looped](Self::is_looped), it plays for a number of seconds.
+    pub(super) fn player(self, is_alone: bool, seconds: u32) -> Vec<String> {
+        let (topic, _) = self.event();
         let camera = match self {
             Self::Brake720 => &["--synthetic", "1280x720@10"][..],
             Self::Brake1080 => &["--synthetic", "1920x1080@10"],
-            Self::Detector => &["--synthetic", "1920x1080@30"],
             Self::Empty | Self::EmptyAwake | Self::ImuFft => &[],
+            Self::Detector => {
+                let (drive, from) =
+                    (sample_drive().display().to_string(), "/camera/front/compressed");
+                let remap = format!("{from}:={topic}");
+                let what = [&drive, "--topics", from, "--remap", &remap, "--raw-images"];
+                // The drive has 10 images in a second.
+                let how = ["--size", "1920x1080", "--rate", "3", "--loop"];
+                return what.into_iter().chain(how).map(str::to_owned).collect();
+            }
         };
-        let has_imu = camera.is_empty() || self.is_brake_dark() && !is_alone;
-        [camera, if has_imu { &["--imu", "100"] } else { &[] }].concat()
+        let has_imu = camera.is_empty() || !is_alone;
+        let imu = if has_imu { &["--imu", "100"][..] } else { &[] };
+        let duration = ["--duration", &seconds.to_string()].map(str::to_owned);
+        camera.iter().chain(imu).map(|it| (*it).to_owned()).chain(duration).collect()
+    }
+
+    /// Returns whether the player repeats a drive until a signal ends it. All synthetic images are
+    /// equal, and the model of a lambda does not run again for an input that equals the last one.
+    pub(super) fn is_looped(self) -> bool {
+        self == Self::Detector
     }
 
     /// Returns the name of the workload in a baseline, and its configuration.
