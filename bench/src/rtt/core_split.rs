@@ -38,7 +38,9 @@ impl CoreSplit {
         let all = usable()?;
         let sides = sides.unwrap_or(&all).clone();
         let others = sides.others_of(&all)?.unwrap_or_else(|| all.clone());
-        bind(&others)?;
+        if others != all {
+            bind(&others)?;
+        }
         Ok(Self { all, sides, others })
     }
 
@@ -52,7 +54,8 @@ impl CoreSplit {
         )
     }
 
-    /// Starts something on the cores of the sides: its threads and processes inherit them.
+    /// Starts something on the cores of the sides: its threads and processes inherit them, and so do
+    /// the threads of this program that wait for its lines.
     pub(super) fn for_side<T>(&self, start: impl FnOnce() -> T) -> T {
         self.on(&self.sides, start)
     }
@@ -63,6 +66,9 @@ impl CoreSplit {
     }
 
     fn on<T>(&self, cores: &CoreList, start: impl FnOnce() -> T) -> T {
+        if *cores == self.others {
+            return start();
+        }
         bind(cores).expect("the cores were usable before");
         let started = start();
         bind(&self.others).expect("this thread was bound to them before");

@@ -3,7 +3,7 @@
 //!
 //! - `workload`: what is answered, and by whom. `sides`: one side of a comparison, for one turn.
 //! - `bare`: a reader that only answers. `node`: a program that a user would write without Gleaner.
-//! - `buffers`: the system's limit of socket buffers. `core_split`: who runs on which cores.
+//! - `buffers`: the system's limit of socket buffers. `core_split`: cores of the sides, and others.
 //! - `goals`: the promises.
 
 mod bare;

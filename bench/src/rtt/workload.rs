@@ -88,8 +88,8 @@ impl Workload {
         }
     }
 
-    /// Returns the arguments of the player: those for the event alone, or for all inputs. Unless the
-    /// workload is [looped](Self::is_looped), it plays for a number of seconds.
+    /// Returns the arguments of the player: those for the event alone, or for all inputs. It plays
+    /// for a number of seconds, unless the workload is [looped](Self::is_looped).
     pub(super) fn player(self, is_alone: bool, seconds: u32) -> Vec<String> {
         let (topic, _) = self.event();
         let camera = match self {
