@@ -54,7 +54,7 @@ impl CoreSplit {
         )
     }
 
-    /// Starts something on the cores of the sides: its threads and processes inherit them, and so do
+    /// Starts something on the cores of the sides: its threads and processes inherit them. So do
     /// the threads of this program that wait for its lines.
     pub(super) fn for_side<T>(&self, start: impl FnOnce() -> T) -> T {
         self.on(&self.sides, start)
