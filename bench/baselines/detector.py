@@ -10,100 +10,18 @@ from __future__ import annotations
 import json
 import sys
 import time
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent / "lib"))
 
 try:
     import cv2
     import numpy as np
     import onnxruntime
+    from detection import Detector
 except ImportError as error:
     print(json.dumps({"missing": f"the Python program cannot import a library: {error}"}))
     sys.exit(0)
-
-BORDER = (114, 114, 114)
-
-
-class Detector:
-    """A model with its input and output of one layout."""
-
-    def __init__(self, path: str, layout: str, threads: int) -> None:
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads
-        options.inter_op_num_threads = 1
-        self.session = onnxruntime.InferenceSession(
-            path, options, providers=["CPUExecutionProvider"]
-        )
-        self.layout = layout
-        self.name = self.session.get_inputs()[0].name
-        self.height, self.width = self.session.get_inputs()[0].shape[2:]
-        self.prepare_ms = self.session_ms = 0.0
-        if layout == "yolox":
-            self.grids, self.strides = self.cells()
-
-    def cells(self) -> tuple[np.ndarray, np.ndarray]:
-        """Corners of the cells of YOLOX, and their strides."""
-        grids, strides = [], []
-        for stride in (8, 16, 32):
-            x, y = np.meshgrid(np.arange(self.width // stride), np.arange(self.height // stride))
-            grids.append(np.stack((x, y), 2).reshape(-1, 2))
-            strides.append(np.full((grids[-1].shape[0], 1), stride))
-        return np.concatenate(grids), np.concatenate(strides)
-
-    def letterbox(self, frame: np.ndarray) -> tuple[np.ndarray, float, int, int]:
-        height, width = frame.shape[:2]
-        ratio = min(self.height / height, self.width / width)
-        if self.layout == "yolox":
-            wide, high, left, top = int(width * ratio), int(height * ratio), 0, 0
-        else:
-            wide, high = round(width * ratio), round(height * ratio)
-            left, top = (self.width - wide) // 2, (self.height - high) // 2
-        resized = cv2.resize(frame, (wide, high), interpolation=cv2.INTER_LINEAR)
-        right, bottom = self.width - wide - left, self.height - high - top
-        padded = cv2.copyMakeBorder(
-            resized, top, bottom, left, right, cv2.BORDER_CONSTANT, value=BORDER
-        )
-        if self.layout == "yolox":
-            blob = cv2.dnn.blobFromImage(padded)
-        else:
-            blob = cv2.dnn.blobFromImage(padded, 1 / 255, swapRB=True)
-        return blob, ratio, left, top
-
-    def decode(self, output: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Boxes by centre and size in pixels of the input, scores and classes."""
-        if self.layout == "yolox":
-            rows = output[0]
-            scores = rows[:, 5:] * rows[:, 4:5]
-            classes = scores.argmax(1)
-            centres = (rows[:, :2] + self.grids) * self.strides
-            sizes = np.exp(rows[:, 2:4]) * self.strides
-            return np.concatenate((centres, sizes), 1), scores.max(1), classes
-        scores = output[0, 4:]
-        return output[0, :4].T, scores.max(0), scores.argmax(0)
-
-    def detect(
-        self, frame: np.ndarray, min_score: float, max_iou: float, max_count: int
-    ) -> list[tuple[int, float, np.ndarray]]:
-        began = time.perf_counter()
-        blob, ratio, left, top = self.letterbox(frame)
-        started = time.perf_counter()
-        self.prepare_ms = 1e3 * (started - began)
-        (output,) = self.session.run(None, {self.name: blob})
-        self.session_ms = 1e3 * (time.perf_counter() - started)
-        boxes, scores, classes = self.decode(output)
-        good = scores >= min_score
-        boxes, scores, classes = boxes[good], scores[good], classes[good]
-        boxes[:, :2] -= boxes[:, 2:] / 2
-        # Only those with an area in the frame.
-        height, width = frame.shape[:2]
-        start = np.clip((boxes[:, :2] - (left, top)) / ratio, 0, (width, height))
-        end = np.clip((boxes[:, :2] + boxes[:, 2:] - (left, top)) / ratio, 0, (width, height))
-        inside = (end > start).all(1)
-        boxes, scores, classes = boxes[inside], scores[inside], classes[inside]
-        found = np.concatenate((start, end - start), 1)[inside]
-        kept = cv2.dnn.NMSBoxesBatched(boxes, scores, classes, min_score, max_iou)
-        kept = np.asarray(kept, int).reshape(-1)
-        kept = kept[np.argsort(-scores[kept], kind="stable")][:max_count]
-        return [(int(classes[at]), float(scores[at]), found[at]) for at in kept]
-
 
 def main() -> None:
     path, frames, layout = sys.argv[1:4]

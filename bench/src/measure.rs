@@ -81,7 +81,7 @@ pub fn python() -> PathBuf {
 
 /// Binds this process and its children to the first core that it may use.
 pub fn bind_to_one_core() -> std::io::Result<()> {
-    bind_to(cores()?.first().copied().unwrap_or(0))
+    bind_to(cores()?.into_iter().take(1))
 }
 
 /// The cores that this thread may use.
@@ -90,11 +90,11 @@ pub fn cores() -> std::io::Result<Vec<usize>> {
     Ok((0..rustix::thread::CpuSet::MAX_CPU).filter(|core| allowed.is_set(*core)).collect())
 }
 
-/// Binds this thread, and the threads and processes that it will start, to one core.
-pub fn bind_to(core: usize) -> std::io::Result<()> {
-    let mut one = rustix::thread::CpuSet::new();
-    one.set(core);
-    Ok(rustix::thread::sched_setaffinity(None, &one)?)
+/// Binds this thread, and the threads and processes that it will start, to some cores.
+pub fn bind_to(cores: impl IntoIterator<Item = usize>) -> std::io::Result<()> {
+    let mut allowed = rustix::thread::CpuSet::new();
+    cores.into_iter().for_each(|core| allowed.set(core));
+    Ok(rustix::thread::sched_setaffinity(None, &allowed)?)
 }
 
 /// Peak of the resident memory of a process in MiB; NaN if unknown.

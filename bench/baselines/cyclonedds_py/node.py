@@ -109,5 +109,5 @@ class Node:
 
 if __name__ == "__main__":
     use_bytes(Image, "data")
-    packages = ("cyclonedds", "numpy", "opencv-python-headless", "opencv-python")
+    packages = ("cyclonedds", "numpy", "opencv-python-headless", "opencv-python", "onnxruntime")
     program.run(workloads, Node, packages, (DDSException,))

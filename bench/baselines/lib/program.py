@@ -19,7 +19,7 @@ import sys
 import threading
 import time
 from importlib import metadata
-from typing import Any, Callable, Dict, List, NoReturn, Optional, Protocol, Tuple, Type
+from typing import Any, Callable, Container, Dict, List, NoReturn, Optional, Protocol, Tuple, Type
 
 WRONG_USE = 2
 """Exit code of a wrong command line, as of `argparse`."""
@@ -58,12 +58,14 @@ def run(
 ) -> None:
     """Runs a baseline from its command line to its end. `packages` are those whose versions it
     states, `errors` those of the middleware."""
-    options = parse(workloads.CONFIG)
+    options = parse(workloads.CONFIG, workloads.WITH_IMAGES)
     end = End()
     try:
         workload = workloads.workload(options.workload, options.config)
     except ValueError as error:
         fail("cannot configure the workload", error, "see [config] of the lambda", WRONG_USE)
+    except ImportError as error:
+        skip(error)
     tally = Tally(options.name)
     try:
         node = open_node(options, workload, tally)
@@ -79,6 +81,7 @@ def run(
         config=options.config,
         depth=options.depth,
         luma=workloads.LUMA,
+        model=getattr(workload, "runtime", None),
         versions=versions(*packages),
     )
     try:
@@ -107,13 +110,15 @@ def fail(what: str, error: BaseException, help_text: str, code: int = 1) -> NoRe
     sys.exit(code)
 
 
-def parse(workloads: Any, arguments: Optional[List[str]] = None) -> argparse.Namespace:
-    """Parses the command line; `workloads` are the names of the workloads. Ends the program with
-    exit code 2 if it is wrong."""
+def parse(
+    workloads: Any, with_images: Container[str], arguments: Optional[List[str]] = None
+) -> argparse.Namespace:
+    """Parses the command line; `workloads` are the names of the workloads, `with_images` those that
+    wake on images. Ends the program with exit code 2 if it is wrong."""
     parser = argparse.ArgumentParser(description="Answers each message that wakes a workload.")
     parser.add_argument("workload", choices=list(workloads))
     parser.add_argument("--input", required=True, metavar="TOPIC", help="sensor_msgs/Imu")
-    parser.add_argument("--image", metavar="TOPIC", help="sensor_msgs/Image, for brake-dark")
+    parser.add_argument("--image", metavar="TOPIC", help="sensor_msgs/Image")
     parser.add_argument(
         "--answers", required=True, metavar="TOPIC", help="sensor_msgs/TimeReference"
     )
@@ -130,7 +135,7 @@ def parse(workloads: Any, arguments: Optional[List[str]] = None) -> argparse.Nam
     for topic in (options.input, options.image, options.answers):
         if topic is not None and not topic.startswith("/"):
             parser.error(f"topic `{topic}` is not absolute: begin it with `/`")
-    if (options.workload == "brake-dark") != (options.image is not None):
+    if (options.workload in with_images) != (options.image is not None):
         need = "needs" if options.image is None else "takes no"
         parser.error(f"workload `{options.workload}` {need} --image")
     if options.depth < 1:

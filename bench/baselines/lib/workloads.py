@@ -12,6 +12,7 @@ from __future__ import annotations
 import importlib.util
 import sys
 from collections import deque
+from importlib import metadata
 from itertools import islice, takewhile
 from pathlib import Path
 from typing import Any, Dict, Optional, Sequence, Tuple
@@ -40,8 +41,15 @@ CONFIG: Dict[str, Dict[str, float]] = {
     "empty": {},
     "imu-fft": {"window_s": 1.25, "rough": 0.5},
     "brake-dark": {"brake_mps2": -3.0, "dark_luma": 50.0},
+    "yolo-detector": {"min_score": 0.4},
 }
 """Workloads, and the values that each can be configured with; the defaults are the manifests'."""
+
+WITH_IMAGES = ("brake-dark", "yolo-detector")
+"""Workloads that wake on images."""
+
+CLASSES = ("person", "bicycle")
+"""Classes that `yolo-detector` reports; the default is the manifest's."""
 
 LUMA = "numpy " + np.__version__ if cv2 is None else "cv2 " + cv2.__version__
 """Library that computes the mean luma of a frame, with its version."""
@@ -164,13 +172,42 @@ class BrakeDark:
         return ("brake-dark",)
 
 
+class YoloDetector:
+    """`examples/yolo-detector`: wakes on each image, without a second input.
+
+    Raises ImportError without ONNX Runtime or OpenCV."""
+
+    # Defaults of a lambda: threads of one run, and of `detect`.
+    THREADS, MAX_IOU, MAX_COUNT = 1, 0.45, 100
+
+    def __init__(self, min_score: float) -> None:
+        # The other workloads do without its libraries.
+        from detection import Detector
+
+        models = ROOT / "examples" / "yolo-detector" / "python" / "models"
+        self.detector = Detector(str(models / "yolox_nano.onnx"), "yolox", self.THREADS)
+        self.runtime = f"onnxruntime {metadata.version('onnxruntime')}, cpu, {self.THREADS} thread"
+        self.names = (models / "coco.txt").read_text("utf-8").splitlines()
+        self.min_score = min_score
+
+    def on_imu(self, imu: Any) -> Optional[Labels]:
+        return None
+
+    def on_image(self, image: Any) -> Labels:
+        found = self.detector.detect(frame(image), self.min_score, self.MAX_IOU, self.MAX_COUNT)
+        names = (self.names[number] for number, _score, _box in found)
+        # Each class once, the one with the highest score first.
+        return tuple(dict.fromkeys(name for name in names if name in CLASSES))
+
+
 def workload(name: str, config: Sequence[str]) -> Any:
     """Returns the workload `name` of `CONFIG`, with KEY=VALUE of `config` in place of defaults.
 
     `on_imu` is called with each IMU message and `on_image`, where there is one, with each image.
     Both return the labels of the triggers; None if the message does not wake the workload.
 
-    Raises ValueError for an unknown key, and for a value that is not a number."""
+    Raises ValueError for an unknown key, and for a value that is not a number; ImportError without
+    a library of the workload."""
     values = dict(CONFIG[name])
     for entry in config:
         key, equals, number = entry.partition("=")
@@ -181,5 +218,10 @@ def workload(name: str, config: Sequence[str]) -> Any:
             values[key] = float(number)
         except ValueError:
             raise ValueError(f"`{number}` of `{key}` is not a number") from None
-    kinds: Dict[str, Any] = {"empty": Empty, "imu-fft": ImuFft, "brake-dark": BrakeDark}
+    kinds: Dict[str, Any] = {
+        "empty": Empty,
+        "imu-fft": ImuFft,
+        "brake-dark": BrakeDark,
+        "yolo-detector": YoloDetector,
+    }
     return kinds[name](**values)

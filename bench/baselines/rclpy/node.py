@@ -89,4 +89,4 @@ class Node:
 
 
 if __name__ == "__main__":
-    program.run(workloads, Node, ("rclpy", "sensor_msgs", "numpy", "opencv-python"))
+    program.run(workloads, Node, ("rclpy", "sensor_msgs", "numpy", "opencv-python", "onnxruntime"))

@@ -87,6 +87,15 @@ def test_a_workload_decides_as_its_lambda(name: str, config: dict[str, float]) -
     assert [label for _, label in found] == [trigger.label for trigger in triggers]
 
 
+def test_the_classes_of_the_detector_are_those_of_its_manifest() -> None:
+    tomllib = pytest.importorskip("tomllib")
+    manifest = (EXAMPLES / "yolo-detector" / "python" / "lambda.toml").read_text("utf-8")
+    config = tomllib.loads(manifest)["config"]
+    assert config.pop("classes")["default"].split(", ") == list(workloads.CLASSES)
+    defaults = {key: entry["default"] for key, entry in config.items()}
+    assert workloads.CONFIG["yolo-detector"] == defaults
+
+
 @pytest.mark.parametrize("name", ["imu-fft", "brake-dark"])
 def test_the_defaults_are_those_of_the_manifest(name: str) -> None:
     tomllib = pytest.importorskip("tomllib")
@@ -154,6 +163,7 @@ def test_the_source_of_an_answer_is_that_of_a_lambda() -> None:
     ("arguments", "cause"),
     [
         (["brake-dark", "--input", "/a", "--answers", "/b"], "needs --image"),
+        (["yolo-detector", "--input", "/a", "--answers", "/b"], "needs --image"),
         (["empty", "--input", "/a", "--answers", "/b", "--image", "/c"], "takes no --image"),
         (["empty", "--input", "a", "--answers", "/b"], "topic `a` is not absolute"),
         (["empty", "--input", "/a", "--answers", "/b", "--depth", "0"], "keeps no message"),
@@ -164,7 +174,7 @@ def test_a_wrong_command_line_is_refused(
     arguments: list[str], cause: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as ended:
-        program.parse(workloads.CONFIG, arguments)
+        program.parse(workloads.CONFIG, workloads.WITH_IMAGES, arguments)
     assert ended.value.code == 2
     assert cause in capsys.readouterr().err
 
@@ -214,6 +224,17 @@ def test_without_rclpy_a_node_is_skipped() -> None:
         pytest.skip("rclpy can be imported here")
     assert node.returncode == program.SKIPPED
     assert "rclpy" in json.loads(output)["skipped"]
+
+
+def test_without_onnx_runtime_a_detector_is_skipped() -> None:
+    arguments = ["--input", "/imu", "--image", "/camera", "--answers", "/rtt"]
+    node = start("yolo-detector", *arguments)
+    line = json.loads(node.stdout.readline()) if node.stdout is not None else {}
+    node.communicate(timeout=60)
+    if "ready" in line:
+        pytest.skip("ONNX Runtime and OpenCV can be imported here")
+    assert node.returncode == program.SKIPPED
+    assert "cannot import `" in line["skipped"]
 
 
 def test_the_socket_buffer_is_the_largest_of_the_bound_sockets() -> None:

@@ -7,9 +7,11 @@
 //! - [`Comparison`] compares two runs.
 //! - [`IsolationCosts`] become a recommendation.
 //! - [`SequenceEntry`] is one of several benchmarks that ran one after the other.
-//! - [`Machine`] is where a run took place, and [`PowerMeter`] measures the power that it takes.
+//! - [`Machine`] is where a run took place, [`CoreList`] a part of its cores, and [`PowerMeter`]
+//!   measures the power that it takes.
 
 mod comparison;
+mod core_list;
 mod figure;
 mod growth;
 mod machine;
@@ -25,6 +27,7 @@ mod statistics;
 mod test_folder;
 
 pub use comparison::Comparison;
+pub use core_list::CoreList;
 pub use figure::{Figure, Goal};
 pub use growth::{Growth, GrowthCurve};
 pub use machine::Machine;

@@ -107,7 +107,7 @@ impl Attacker {
         ];
         let start = || {
             // Child processes inherit the core of their thread.
-            bind_to(core).expect("an allowed core");
+            bind_to([core]).expect("an allowed core");
             let args = settings.iter().flat_map(|setting| ["--set", setting]).collect::<Vec<_>>();
             run(lambda.path(), out.path(), &args)
         };
@@ -187,7 +187,7 @@ impl Attacker {
 /// A thread that is busy on `core` in attacked blocks, and sleeps in quiet ones.
 fn busy(core: usize, end_ns: i64, clock: Clock) -> JoinHandle<()> {
     thread::spawn(move || {
-        bind_to(core).expect("an allowed core");
+        bind_to([core]).expect("an allowed core");
         while clock.now() < end_ns {
             if clock.now() / (BLOCK_MS * 1_000_000) % 2 == 0 {
                 thread::sleep(Duration::from_millis(1));

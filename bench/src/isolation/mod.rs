@@ -76,7 +76,7 @@ fn attacks(quick: bool, figures: &mut Vec<Figure>) -> Result<AttackCounts, Strin
     let [own, attacker, ..] = cores[..] else {
         return Err("victim and attacker need one core each".to_owned());
     };
-    bind_to(own).map_err(|error| format!("cannot bind to one core: {error}"))?;
+    bind_to([own]).map_err(|error| format!("cannot bind to one core: {error}"))?;
     let before = figures.len();
     on_victims(quick, attacker, figures);
     let compared = figures[before..]

@@ -39,6 +39,7 @@ pub(super) fn of_group(
         Workload::Brake720 | Workload::Brake1080 => {
             (&[NodeSide::STAND_IN, NodeSide::RCLPY], &of_images)
         }
+        Workload::Detector => return add_processed(group, figures),
     };
     for series in group.series.iter().filter(|series| is_ours(series)) {
         let Series { name, values, reception, .. } = series;
@@ -54,6 +55,16 @@ pub(super) fn of_group(
                 figures.push(Figure::at_most(&row, "times", *goal, &[of(&ours) / of(&theirs)]));
             }
         }
+    }
+}
+
+/// Adds the frames that each side processed. One that takes longer than a period of the camera
+/// skips some.
+fn add_processed(group: &SeriesGroup, figures: &mut Vec<Figure>) {
+    for series in &group.series {
+        let share = series.reception.map_or(f64::NAN, |it| it.answered as f64 / it.sent as f64);
+        let row = format!("{}, {}: frames processed of published", group.name, series.name);
+        figures.push(Figure::without_goal(&row, "%", &[100.0 * share]));
     }
 }
 

@@ -3,10 +3,12 @@
 //!
 //! - `workload`: what is answered, and by whom. `sides`: one side of a comparison, for one turn.
 //! - `bare`: a reader that only answers. `node`: a program that a user would write without Gleaner.
-//! - `buffers`: the system's limit of socket buffers. `goals`: the promises.
+//! - `buffers`: the system's limit of socket buffers. `core_split`: cores of the sides, and others.
+//! - `goals`: the promises.
 
 mod bare;
 mod buffers;
+mod core_split;
 mod goals;
 mod node;
 mod sides;
@@ -17,7 +19,8 @@ use std::sync::Arc;
 
 use clap::Args;
 use gleaner_bench_results::{
-    BenchResults, Growth, GrowthCurve, PowerMeter, Reception, Series, SeriesGroup, quantile,
+    BenchResults, CoreList, Growth, GrowthCurve, PowerMeter, Reception, Series, SeriesGroup,
+    quantile,
 };
 use gleaner_dds::{Dds, DdsOptions};
 
@@ -25,6 +28,7 @@ use crate::answers::RttReceiver;
 use crate::live::BusyCores;
 use crate::measure::shuffled;
 use buffers::BufferLimit;
+use core_split::{CoreSplit, cores_of_sides};
 use sides::{Side, Turn};
 pub(crate) use workload::Workload;
 
@@ -49,6 +53,10 @@ pub struct RttOptions {
     /// Only this workload; may be repeated [default: all].
     #[arg(long, value_name = "NAME")]
     workload: Vec<Workload>,
+    /// Cores of all sides, such as 2-5 or 0,2; the sender and the recorder run on the others, if
+    /// there are others [default: all run on all].
+    #[arg(long, value_name = "LIST", value_parser = cores_of_sides)]
+    cpus: Option<CoreList>,
 }
 
 /// Measures all workloads.
@@ -67,6 +75,8 @@ pub fn measure(quick: bool, options: &RttOptions, results: &mut BenchResults) {
          the stamp of the answer, just before it is sent."
             .to_owned(),
     );
+    let split = CoreSplit::of(options.cpus.as_ref()).expect("the command line was checked");
+    results.notes.extend(options.cpus.is_some().then(|| split.note()));
     let meter = PowerMeter::of_this_machine();
     if !meter.is_available() {
         let note = "Power is skipped: no RAPL and no INA3221 can be read on this machine.";
@@ -90,12 +100,12 @@ pub fn measure(quick: bool, options: &RttOptions, results: &mut BenchResults) {
             let granted = limit.bytes();
             let name = workload.title(granted);
             eprintln!("{name}");
-            let busy = workload.is_awake().then(BusyCores::start);
+            let busy = workload.is_awake().then(|| split.for_all(BusyCores::start));
             if let Some(Err(error)) = &busy {
                 results.notes.push(format!("{name} is skipped: no busy cores: {error}"));
                 continue;
             }
-            compare(workload, name, granted, &options, &meter, results);
+            compare(workload, name, granted, &options, (&split, &meter), results);
         }
     }
 }
@@ -106,7 +116,7 @@ fn compare(
     name: String,
     granted: u64,
     options: &RttOptions,
-    meter: &PowerMeter,
+    machine: (&CoreSplit, &PowerMeter),
     results: &mut BenchResults,
 ) {
     let mut dds = Dds::open(DdsOptions::new("/gleaner_bench/answers")).expect("a private network");
@@ -118,7 +128,7 @@ fn compare(
     for _ in 0..options.turns {
         for index in shuffled(sides.len(), &mut random) {
             let seconds = [options.warm_up, options.turn];
-            match sides[index].turn(workload, &answers, meter, seconds) {
+            match sides[index].turn(workload, &answers, machine, seconds) {
                 Ok(turn) => turns.entry(index).or_default().push(turn),
                 Err(why) => {
                     let note = format!("{}: skipped: {why}", sides[index].name());

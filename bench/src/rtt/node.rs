@@ -22,9 +22,10 @@ pub(super) enum NodeKind {
     RclpyKeepingMemory,
 }
 
-/// A node, and the limit of socket buffers.
+/// A node, the number of messages that its topics keep, and the limit of socket buffers.
 pub(super) struct NodeSide {
     pub(super) kind: NodeKind,
+    pub(super) depth: u32,
     pub(super) buffer: u64,
 }
 
@@ -36,11 +37,12 @@ const KEEPING: [(&str, &str); 3] = [
 ];
 
 /// Facts that a node states, and their names in the table.
-const FACTS: [(&str, &str); 4] = [
+const FACTS: [(&str, &str); 5] = [
     ("stack", "stack"),
     ("socket_buffer", "socket buffer, B"),
     ("depth", "depth"),
     ("luma", "luma"),
+    ("model", "model"),
 ];
 
 impl NodeSide {
@@ -49,11 +51,18 @@ impl NodeSide {
     /// Name of the ROS 2 node.
     pub(super) const RCLPY: &'static str = "rclpy";
 
-    pub(super) fn name(&self) -> &'static str {
-        match self.kind {
+    /// Number of messages that a topic keeps in ROS 2 by default.
+    pub(super) const DEPTH: u32 = 10;
+
+    pub(super) fn name(&self) -> String {
+        let name = match self.kind {
             NodeKind::StandIn => Self::STAND_IN,
             NodeKind::Rclpy => Self::RCLPY,
             NodeKind::RclpyKeepingMemory => "rclpy, memory kept",
+        };
+        match self.depth {
+            Self::DEPTH => name.to_owned(),
+            depth => format!("{name}, depth {depth}"),
         }
     }
 
@@ -80,6 +89,7 @@ impl NodeSide {
         let mut command = Command::new(python);
         command.arg(root().join("bench/baselines").join(folder).join("node.py")).arg(name);
         command.args(["--input", "/imu/synthetic", "--answers", ANSWERS]);
+        command.args(["--depth", &self.depth.to_string()]);
         if workload.is_of_images() {
             command.args(["--image", workload.event().0]);
         }

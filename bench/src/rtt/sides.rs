@@ -6,11 +6,13 @@ use std::time::{Duration, Instant};
 
 use gleaner_bench_results::{Figure, PowerMeter};
 use gleaner_protocol::LiveStatus;
+use gleaner_protocol::inference::InferenceReport;
 use gleaner_tests::live::{PATIENCE, RunningProgram, cpu_ns, descendants, play, run};
 use gleaner_tests::{LambdaCopy, TempFolder};
 
 use super::ANSWERS;
 use super::bare::BareReader;
+use super::core_split::CoreSplit;
 use super::node::NodeSide;
 use super::workload::Workload;
 use crate::answers::{RttAnswer, RttReceiver};
@@ -32,6 +34,8 @@ pub(super) enum Side {
 
 /// A lambda, and its status at the end of the last turn.
 pub(super) struct LambdaSide {
+    /// Name among the lambdas of its workload.
+    pub(super) name: String,
     pub(super) kind: Twin,
     pub(super) lambda: LambdaCopy,
     pub(super) last: Option<LiveStatus>,
@@ -69,8 +73,8 @@ impl Side {
     pub(super) fn name(&self) -> String {
         match self {
             Self::Bare => Self::BARE.to_owned(),
-            Self::Lambda(side) => format!("lambda, {}", side.kind),
-            Self::Node(side) => side.name().to_owned(),
+            Self::Lambda(side) => format!("lambda, {}", side.name),
+            Self::Node(side) => side.name(),
         }
     }
 
@@ -83,15 +87,15 @@ impl Side {
         &mut self,
         workload: Workload,
         answers: &RttReceiver,
-        meter: &PowerMeter,
+        (split, meter): (&CoreSplit, &PowerMeter),
         [warm_up, measured]: [u32; 2],
     ) -> Result<Turn, String> {
-        let (running, mut facts) = self.start(workload)?;
+        let (running, mut facts) = split.for_side(|| self.start(workload))?;
         answers.take();
-        let duration = (warm_up + measured).to_string();
-        let is_alone = matches!(self, Self::Bare);
-        let player = ["--stamp", "monotonic", "--wait", "1", "--duration", &duration];
-        let player = play(&[&workload.player(is_alone)[..], &player].concat());
+        let player = workload.player(matches!(self, Self::Bare), warm_up + measured);
+        let mut arguments = vec!["--stamp", "monotonic", "--wait", "1"];
+        arguments.extend(player.iter().map(String::as_str));
+        let player = play(&arguments);
         let mut received = first(answers, &self.name());
         sleep(Duration::from_secs(warm_up.into()));
         let (before, began) = (running.cpu_ns(), Instant::now());
@@ -106,6 +110,9 @@ impl Side {
         let cpu = running.cpu_ns().zip(before).map(|(after, before)| after.saturating_sub(before));
         let span = began.elapsed();
         let memory_mb = memory.last().map(|[_, mb]| *mb);
+        if workload.is_looped() {
+            player.signal("INT");
+        }
         let played = player.finish();
         let sent = played.sent()[workload.event().0];
         // The last answers may still be on their way.
@@ -156,7 +163,10 @@ impl Side {
             RunningSide::Bare(reader) => reader.stop(),
             RunningSide::Lambda(started, _out) => {
                 started.signal("INT");
-                let live = started.finish().ended();
+                let finished = started.finish();
+                let runtime = finished.lines.iter().find_map(|line| model_runtime(line));
+                facts.extend(runtime.map(|runtime| ("model".to_owned(), runtime)));
+                let live = finished.ended();
                 let granted = live.network.buffer_granted;
                 facts.insert("socket buffer, B".to_owned(), granted.to_string());
                 if let Self::Lambda(side) = self {
@@ -189,7 +199,7 @@ impl Side {
             for (share, ns, goal) in
                 [("p50", stats.p50_ns, goals[0]), ("p99", stats.p99_ns, goals[1])]
             {
-                let name = format!("{group}, {}: {what}, {share}", side.kind);
+                let name = format!("{group}, {}: {what}, {share}", side.name);
                 let us = [ns as f64 / 1e3];
                 figures.push(if has_goal && !workload.is_of_images() {
                     Figure::at_most(&name, "us", goal, &us)
@@ -223,6 +233,14 @@ impl RunningSide {
         let processes = self.processes();
         let mib = (!processes.is_empty()).then(|| processes.into_iter().map(pss_mib).sum::<f64>());
         mib.filter(|mib| mib.is_finite()).map(|mib| mib * f64::from(1 << 20) / 1e6)
+    }
+}
+
+/// Returns what ran the model of a lambda, if a line is the last report of its process.
+fn model_runtime(line: &str) -> Option<String> {
+    match serde_json::from_str(line) {
+        Ok(InferenceReport::Ended(status)) => Some(status.models.first()?.runtime.clone()),
+        _ => None,
     }
 }
 
