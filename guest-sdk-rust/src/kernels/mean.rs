@@ -1,14 +1,19 @@
 //! Computes mean values of numbers and of the colours of an image.
 
+use std::hint::black_box;
+
 use super::luma::sums;
 use super::{Colours, Image};
 
 /// Number of parallel sums.
 const LANES: usize = 16;
 
-/// Values that one iteration of the loop adds: saving the sums for the check of fuel and deadline
-/// takes as long as 16 additions.
-const TURN: usize = 8 * LANES;
+/// Groups of values, one for each sum, that one iteration of the loop adds.
+const GROUPS: usize = 8;
+
+/// The values of one iteration. An array of arrays, so that the offset of each vector is an
+/// immediate of its load instruction.
+type Turn<T> = [[[T; 2]; LANES / 2]; GROUPS];
 
 /// Returns the arithmetic mean of `values`, of any number type that fits an `f64`, in the unit of
 /// the values; none if there are none.
@@ -17,9 +22,9 @@ const TURN: usize = 8 * LANES;
 /// It may differ in its last bits from a sum from left to right, such as
 /// [`Column::mean`](crate::Column::mean), and is more exact.
 pub fn mean<T: Copy + Into<f64>>(values: &[T]) -> Option<f64> {
-    let (turns, rest) = values.as_chunks::<TURN>();
+    let turns: &[Turn<T>] = values.as_chunks().0.as_chunks().0.as_chunks().0;
     let mut lanes = long_sums(turns);
-    for group in rest.chunks(LANES) {
+    for group in values[turns.len() * GROUPS * LANES..].chunks(LANES) {
         for (lane, value) in lanes.iter_mut().zip(group) {
             *lane += (*value).into();
         }
@@ -29,17 +34,35 @@ pub fn mean<T: Copy + Into<f64>>(values: &[T]) -> Option<f64> {
 
 /// Returns the sums of every sixteenth value. Not inlined, since the compiler does not vectorise it
 /// inside of its caller.
+///
+/// The sums stay in memory. In a component, additions happen only where their result is needed: in
+/// registers, that would be after the last load, and most loaded values would go through the stack.
 #[inline(never)]
-fn long_sums<T: Copy + Into<f64>>(turns: &[[T; TURN]]) -> [f64; LANES] {
-    let mut lanes = [0.0_f64; LANES];
+fn long_sums<T: Copy + Into<f64>>(turns: &[Turn<T>]) -> [f64; LANES] {
+    let mut lanes = [[0.0_f64; 2]; LANES / 2];
     for turn in turns {
-        for group in turn.as_chunks::<LANES>().0 {
-            for (lane, value) in lanes.iter_mut().zip(group) {
-                *lane += (*value).into();
-            }
-        }
+        let [a, b, c, d, e, f, g, h] = black_box(&mut lanes);
+        add_pairs::<T, 0>(turn, a);
+        add_pairs::<T, 1>(turn, b);
+        add_pairs::<T, 2>(turn, c);
+        add_pairs::<T, 3>(turn, d);
+        add_pairs::<T, 4>(turn, e);
+        add_pairs::<T, 5>(turn, f);
+        add_pairs::<T, 6>(turn, g);
+        add_pairs::<T, 7>(turn, h);
     }
-    lanes
+    std::array::from_fn(|lane| lanes.as_flattened()[lane])
+}
+
+#[inline(always)]
+fn add_pairs<T: Copy + Into<f64>, const AT: usize>(turn: &Turn<T>, lanes: &mut [f64; 2]) {
+    let [mut even, mut odd] = *lanes;
+    for group in turn {
+        let [first, second] = group[AT].map(Into::into);
+        even += first;
+        odd += second;
+    }
+    *lanes = [even, odd];
 }
 
 /// Returns the means of red, green and blue, each 0 to 255; for a mono8 image, three times the mean
