@@ -145,7 +145,11 @@ fn starts_and_stops() -> Result<(), Failed> {
         .map(|index| {
             let (_, topic) = topics[index % 2];
             let lambda = format!("tests/lambdas/ticker/{}", ["rust", "python"][index / 2 % 2]);
-            let on_topic = |manifest: String| manifest.replace("/imu/data", topic);
+            let on_topic = |manifest: String| {
+                let on_topic = manifest.replace("/imu/data", topic);
+                // A busy machine meets it.
+                on_topic.replace("[limits]", "[limits]\ndeadline = \"5s\"")
+            };
             LambdaCopy::changed_and_named(&lambda, &format!("ticker-{index}"), on_topic)
         })
         .collect();

@@ -184,7 +184,12 @@ fn kill_some(
             let mut named = descendants(started.pid(), victim);
             let others = others.iter().flat_map(|name| descendants(started.pid(), name));
             let others: Vec<u32> = others.collect();
-            named.retain(|pid| !others.contains(pid));
+            // A child that has not executed its program yet has the arguments of its parent.
+            let is_of_parent = |pid: &u32| {
+                std::fs::read_to_string(format!("/proc/{pid}/comm"))
+                    .is_ok_and(|name| name == "gleaner\n")
+            };
+            named.retain(|pid| !others.contains(pid) && !is_of_parent(pid));
             pid = named.pop();
             pid.is_some()
         });

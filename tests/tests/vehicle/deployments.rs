@@ -266,7 +266,7 @@ pub fn killed_by_itself() {
     vehicle.start();
     let code = "def __init__(self, ctx):\n\
                 \u{20}   import os, threading\n\
-                \u{20}   threading.Timer(0.2, os.kill, (os.getpid(), 9)).start()\n\
+                \u{20}   threading.Timer(0.25, os.kill, (os.getpid(), 9)).start()\n\
                 def on_tick(self, ctx):\n    pass";
     let lambda = PythonLambda::new("killer", code);
     vehicle.deploy(lambda.path(), &[]);
@@ -277,7 +277,8 @@ pub fn killed_by_itself() {
     let reason = status.last_end.unwrap_or_default();
     assert!(reason.contains("killed 15 times in a row"), "{reason}");
     assert!(reason.contains("signal 9 (SIGKILL), by another program or by the lambda"), "{reason}");
-    assert_eq!(status.restarts, 14);
+    // An end in a wake counts as a fault of the lambda instead, and it is started again.
+    assert!((14..=17).contains(&status.restarts), "{}", status.restarts);
 }
 
 pub fn at_once() {
