@@ -36,8 +36,8 @@ pub fn downscaled(image: &Image<'_>, width: u32, height: u32) -> Result<usize, I
 /// [`Frame::resize`](crate::Frame::resize) where no side grows.
 ///
 /// A new pixel is the mean of the area that it covers, computed exactly and rounded to nearest
-/// (halves up). Allocates 12 bytes for each byte in a row of the old image, and 8 for each pixel in a
-/// row of the new one.
+/// (halves up). Allocates 12 bytes for each byte in a row of the old image, and 8 for each pixel in
+/// a row of the new one.
 ///
 /// # Errors
 ///
@@ -64,7 +64,7 @@ pub fn downscale(
         for (source, row) in (taps.first..=taps.last).zip(image.rows_from(taps.first as usize)) {
             add_weighted(row, down.weight(taps, source), &mut columns);
         }
-        let row = Row { columns: &columns, sums: &mut sums, edges: &edges, across, rounded };
+        let row = PixelRow { columns: &columns, sums: &mut sums, edges: &edges, across, rounded };
         match image.colours {
             Colours::Grey => row.blend(line, |[grey]| [grey]),
             Colours::Rgb => row.blend(line, |rgb: [u8; 3]| rgb),
@@ -92,7 +92,7 @@ fn add_weighted(row: &[u8], weight: u32, columns: &mut [u32]) {
 }
 
 /// A row of old pixels that becomes one of new pixels.
-struct Row<'a> {
+struct PixelRow<'a> {
     columns: &'a [u32],
     /// Place for the sums of all old pixels before each one, and one more.
     sums: &'a mut [u64],
@@ -101,7 +101,7 @@ struct Row<'a> {
     rounded: RoundedDivision,
 }
 
-impl Row<'_> {
+impl PixelRow<'_> {
     /// Writes new pixels of `N` bytes; `arrange` reorders the bytes of a pixel.
     ///
     /// The sum of a new pixel is the difference of the sums before its two edges, so that the

@@ -13,7 +13,7 @@ const GROUPS: usize = 8;
 
 /// The values of one iteration. An array of arrays, so that the offset of each vector is an
 /// immediate of its load instruction.
-type Turn<T> = [[[T; 2]; LANES / 2]; GROUPS];
+type SumBlock<T> = [[[T; 2]; LANES / 2]; GROUPS];
 
 /// Returns the arithmetic mean of `values`, of any number type that fits an `f64`, in the unit of
 /// the values; none if there are none.
@@ -22,7 +22,7 @@ type Turn<T> = [[[T; 2]; LANES / 2]; GROUPS];
 /// It may differ in its last bits from a sum from left to right, such as
 /// [`Column::mean`](crate::Column::mean), and is more exact.
 pub fn mean<T: Copy + Into<f64>>(values: &[T]) -> Option<f64> {
-    let turns: &[Turn<T>] = values.as_chunks().0.as_chunks().0.as_chunks().0;
+    let turns: &[SumBlock<T>] = values.as_chunks().0.as_chunks().0.as_chunks().0;
     let mut lanes = long_sums(turns);
     for group in values[turns.len() * GROUPS * LANES..].chunks(LANES) {
         for (lane, value) in lanes.iter_mut().zip(group) {
@@ -38,7 +38,7 @@ pub fn mean<T: Copy + Into<f64>>(values: &[T]) -> Option<f64> {
 /// The sums stay in memory. In a component, additions happen only where their result is needed: in
 /// registers, that would be after the last load, and most loaded values would go through the stack.
 #[inline(never)]
-fn long_sums<T: Copy + Into<f64>>(turns: &[Turn<T>]) -> [f64; LANES] {
+fn long_sums<T: Copy + Into<f64>>(turns: &[SumBlock<T>]) -> [f64; LANES] {
     let mut lanes = [[0.0_f64; 2]; LANES / 2];
     for turn in turns {
         let [a, b, c, d, e, f, g, h] = black_box(&mut lanes);
@@ -55,7 +55,7 @@ fn long_sums<T: Copy + Into<f64>>(turns: &[Turn<T>]) -> [f64; LANES] {
 }
 
 #[inline(always)]
-fn add_pairs<T: Copy + Into<f64>, const AT: usize>(turn: &Turn<T>, lanes: &mut [f64; 2]) {
+fn add_pairs<T: Copy + Into<f64>, const AT: usize>(turn: &SumBlock<T>, lanes: &mut [f64; 2]) {
     let [mut even, mut odd] = *lanes;
     for group in turn {
         let [first, second] = group[AT].map(Into::into);
