@@ -23,6 +23,7 @@ except ImportError as error:
     print(json.dumps({"missing": f"the Python program cannot import a library: {error}"}))
     sys.exit(0)
 
+
 def main() -> None:
     path, frames, layout = sys.argv[1:4]
     width, height, threads = map(int, sys.argv[4:7])
