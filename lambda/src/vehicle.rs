@@ -47,6 +47,8 @@ pub struct NetworkSettings {
     pub domain: Option<u16>,
     /// Addresses of the network interfaces; without any, all.
     pub interfaces: Vec<IpAddr>,
+    /// Whether topics are received with real-time priority, where the system permits it.
+    pub real_time: bool,
 }
 
 /// `[recording]`: settings of the recorder of the daemon.
@@ -201,6 +203,7 @@ mod tests {
             [network]
             domain = 7
             interfaces = ["10.0.0.5", "::1"]
+            real_time = true
             [recording]
             commands = "/record"
             clips_max = 100
@@ -217,6 +220,7 @@ mod tests {
         assert_eq!(labels, ["b", "berlin"]);
         assert_eq!(vehicle.network.domain, Some(7));
         assert_eq!(vehicle.network.interfaces.len(), 2);
+        assert!(vehicle.network.real_time);
         assert_eq!(vehicle.recording.commands.unwrap().as_str(), "/record");
         assert_eq!((vehicle.recording.clips_max, vehicle.recording.disk_floor), (Some(100), None));
         let deployments = DeploymentSettings {

@@ -26,6 +26,7 @@ pub const UNSAFE_FILES: &[&str] = &[
     "host/buffers/tests/shared_ring.rs",
     "host/dds/src/joins.rs",
     "host/feed/src/topic.rs",
+    "host/ingress/src/program/real_time.rs",
     "host/ingress/tests/kills.rs",
     "host/ingress/tests/suite/hostile.rs",
     "host/jail/src/cgroup_join.rs",

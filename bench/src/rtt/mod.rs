@@ -57,6 +57,9 @@ pub struct RttOptions {
     /// there are others [default: all run on all].
     #[arg(long, value_name = "LIST", value_parser = cores_of_sides)]
     cpus: Option<CoreList>,
+    /// Lambdas receive with real-time priority, as by `gleaner run --real-time`.
+    #[arg(long)]
+    real_time: bool,
 }
 
 /// Measures all workloads.
@@ -121,7 +124,7 @@ fn compare(
 ) {
     let mut dds = Dds::open(DdsOptions::new("/gleaner_bench/answers")).expect("a private network");
     let answers: Arc<RttReceiver> = RttReceiver::on(&mut dds, ANSWERS);
-    let mut sides = workload.sides(granted);
+    let mut sides = workload.sides(granted, options.real_time);
     let mut turns: BTreeMap<usize, Vec<Turn>> = BTreeMap::new();
     let mut random = options.seed.max(1);
     let mut memory = Vec::new();

@@ -38,6 +38,8 @@ pub(super) struct LambdaSide {
     pub(super) name: String,
     pub(super) kind: Twin,
     pub(super) lambda: LambdaCopy,
+    /// Whether its topics are received with real-time priority.
+    pub(super) real_time: bool,
     pub(super) last: Option<LiveStatus>,
 }
 
@@ -144,7 +146,8 @@ impl Side {
             }
             Self::Lambda(side) => {
                 let out = TempFolder::new();
-                let args = ["--no-record", "--rtt", ANSWERS];
+                let mut args = vec!["--no-record", "--rtt", ANSWERS];
+                args.extend(side.real_time.then_some("--real-time"));
                 let started = run(side.lambda.path(), out.path(), &args);
                 started.until_ready();
                 let stack = fact("stack", "RustDDS, in gleaner-ingress");
@@ -169,6 +172,10 @@ impl Side {
                 let live = finished.ended();
                 let granted = live.network.buffer_granted;
                 facts.insert("socket buffer, B".to_owned(), granted.to_string());
+                if live.network.real_time {
+                    let stack = "RustDDS, in gleaner-ingress, in real time";
+                    facts.insert("stack".to_owned(), stack.to_owned());
+                }
                 if let Self::Lambda(side) = self {
                     side.last = Some(live);
                 }

@@ -128,10 +128,12 @@ impl Workload {
         }
     }
 
-    /// Returns all sides. `buffer` is the limit of socket buffers.
-    pub(super) fn sides(self, buffer: u64) -> Vec<Side> {
+    /// Returns all sides. `buffer` is the limit of socket buffers; lambdas receive in real time if
+    /// `real_time`.
+    pub(super) fn sides(self, buffer: u64, real_time: bool) -> Vec<Side> {
         let lambda = |name: &str, kind, lambda| {
-            Side::Lambda(Box::new(LambdaSide { name: name.to_owned(), kind, lambda, last: None }))
+            let name = name.to_owned();
+            Side::Lambda(Box::new(LambdaSide { name, kind, lambda, real_time, last: None }))
         };
         let twins = [Twin::Rust, Twin::Python]
             .map(|kind| lambda(&kind.to_string(), kind, self.lambda(kind)));

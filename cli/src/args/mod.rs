@@ -249,6 +249,9 @@ pub struct RunArgs {
     #[command(flatten)]
     #[allow(missing_docs)]
     pub sign: SignArgs,
+    /// Receive with real-time priority, where the system permits it; see docs/live.md
+    #[arg(long, conflicts_with = "drive")]
+    pub real_time: bool,
     /// Create a control group for each lambda's process in this cgroup v2 folder, which must be
     /// delegated to this user
     #[arg(long, value_name = "DIR")]

@@ -81,10 +81,11 @@ fn write_network(text: &mut String, network: &NetworkStatus, paint: Paint) -> fm
         writeln!(text, "  {}", paint.yellow(&visible(why)))?;
     }
     let line = format!(
-        "{}, socket buffer {:.1} of {:.1} MiB requested",
+        "{}, socket buffer {:.1} of {:.1} MiB requested{}",
         counted(network.participants as u64, "participant"),
         mib(network.buffer_granted as u64),
         mib(network.buffer_requested as u64),
+        if network.real_time { ", real-time priority" } else { "" },
     );
     writeln!(text, "  {}", paint.dim(&line))
 }
@@ -102,6 +103,7 @@ mod tests {
             participants: 2,
             buffer_requested: 8 << 20,
             buffer_granted: 1 << 20,
+            real_time: true,
             socket_drops: 3,
             filtered: 1,
             unfiltered: Some("no filter here".to_owned()),
@@ -138,7 +140,7 @@ mod tests {
                 "  lost: 3 datagrams, dropped: socket buffer full",
                 "  lost: 1 datagram, dropped: too large fragments, or fragments of unknown participants",
                 "  no filter here",
-                "  2 participants, socket buffer 1.0 of 8.0 MiB requested",
+                "  2 participants, socket buffer 1.0 of 8.0 MiB requested, real-time priority",
                 "  3.0 MiB reserved for samples, 5.0 MiB resident, 1.0 s of CPU time",
             ]
         );

@@ -29,12 +29,13 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
 
 /// Returns what the lambdas share.
 fn spec(args: &RunArgs, signing: Option<ClipSigning>) -> RunSpec {
+    let real_time = args.real_time.then(|| "--real-time".into());
     RunSpec {
         clips: lambdas::out(args),
         vehicle: args.vehicle.clone(),
         drives: args.drive.clone(),
         rate: args.rate,
-        network: args.network.to_args().collect(),
+        network: args.network.to_args().chain(real_time).collect(),
         largest: 0,
         duration: args.last.map(|seconds| Duration::from_secs(seconds.into())),
         all: args.all,

@@ -104,6 +104,7 @@ pub struct Dds {
     watchdog: Mutex<Watchdog>,
     domain: u16,
     buffer: (usize, usize),
+    real_time: bool,
     /// Topic, type and status of each subscription, by its number.
     subscriptions: BTreeMap<usize, (TopicSpec, Arc<SubscriptionStatus>)>,
     /// Number of the next subscription.
@@ -159,6 +160,7 @@ impl Dds {
             watchdog: Mutex::new(Watchdog::new(sockets, threads)),
             domain: options.domain,
             buffer: (asked, granted(asked, needed)),
+            real_time: options.real_time,
             subscriptions: BTreeMap::new(),
             next: 0,
             definitions: Mutex::new(DefinitionsCache::new(Sources::new(
@@ -298,6 +300,7 @@ impl LiveSource for Dds {
             participants: self.state.peers().participants(),
             buffer_requested: self.buffer.0,
             buffer_granted: self.buffer.1,
+            real_time: self.real_time,
             // The kernel counts these for all programs in the network namespace together. If
             // buffers of other programs were full as well, some of the drops counted here were in
             // fact filtered.

@@ -38,6 +38,9 @@ pub struct DdsOptions {
     /// Bytes of the largest sample, which sets the size of socket buffers; 0 if no samples are to
     /// be received.
     pub largest: usize,
+    /// Whether this process runs in real time and keeps the memory that it frees: then memory for
+    /// samples is mapped before the first one.
+    pub real_time: bool,
     /// Folders with message definitions, searched first.
     pub messages: Vec<PathBuf>,
     /// Install prefixes of ROS 2, searched last; `AMENT_PREFIX_PATH`.
@@ -114,6 +117,7 @@ impl DdsOptions {
             node: node.into(),
             distro: None,
             largest: 8 << 20,
+            real_time: false,
             messages: Vec::new(),
             prefixes: Vec::new(),
             clock: Clock::from_time_of_day(),

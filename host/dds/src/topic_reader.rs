@@ -80,6 +80,10 @@ pub(super) fn index(token: Token) -> Option<usize> {
     token.0.checked_sub(FIRST)
 }
 
+/// Times the memory of the samples that RustDDS keeps, with that of incomplete ones: those that
+/// their writer no longer has stay for 10 s.
+const WITH_INCOMPLETE: usize = 3;
+
 /// Number of samples that RustDDS keeps for a topic.
 fn kept(spec: &TopicSpec) -> usize {
     let bytes = spec.max_bytes.max(1);
@@ -129,6 +133,12 @@ impl TopicReader {
     /// Bytes of the largest sample that is expected.
     pub(super) fn largest(&self) -> usize {
         self.spec.max_bytes
+    }
+
+    /// Returns the number of samples that are in memory at the same time, and the bytes of the
+    /// largest one.
+    pub(super) fn memory_needed(&self) -> (usize, usize) {
+        (WITH_INCOMPLETE * kept(&self.spec), self.spec.max_bytes)
     }
 
     pub(super) fn guid(&self) -> Option<GUID> {

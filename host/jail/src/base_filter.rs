@@ -109,6 +109,7 @@ const MACHINE_CALLS: &[i64] = &[];
 
 /// Applies these limits to this process and its descendants. Returns the layers that hold.
 pub fn apply() -> Vec<Layer> {
+    forbid_real_time();
     vec![
         no_new_privileges(),
         drop_capabilities(),
@@ -116,6 +117,13 @@ pub fn apply() -> Vec<Layer> {
         limit_open_files(),
         deny_calls(),
     ]
+}
+
+/// Forbids real-time priority, which the starter may have for the ingress: a lambda that has it
+/// would take a core from everyone else.
+fn forbid_real_time() {
+    // Lowering a limit is never refused.
+    let _ = setrlimit(Resource::Rtprio, Rlimit { current: Some(0), maximum: Some(0) });
 }
 
 /// Drops the capabilities of root, and of users who were granted some. Those on files are kept: in

@@ -18,7 +18,7 @@ use gleaner_protocol::{Holds, Layer};
 use rustix::fs::{FallocateFlags, MemfdFlags, fallocate, memfd_create};
 use rustix::io::Errno;
 use rustix::net::{AddressFamily, SocketAddrUnix, SocketType, bind, connect, listen, socket};
-use rustix::process::{Resource, getpid, getppid, getrlimit, test_kill_process};
+use rustix::process::{Resource, Rlimit, getpid, getppid, getrlimit, test_kill_process};
 
 /// Set in the process that a test starts.
 const CHILD: &str = "GLEANER_JAIL_TEST";
@@ -118,6 +118,19 @@ fn a_lambda_takes_no_pages_from_other_processes() {
             // SAFETY: no bytes are named.
             assert_eq!(unsafe { libc::madvise(std::ptr::null_mut(), 0, advice) }, 0);
         }
+    });
+}
+
+#[test]
+fn no_process_takes_real_time_priority() {
+    in_own_process("no_process_takes_real_time_priority", || {
+        base_filter::apply();
+        let none = Rlimit { current: Some(0), maximum: Some(0) };
+        assert_eq!(getrlimit(Resource::Rtprio), none);
+        let priority = libc::sched_param { sched_priority: 1 };
+        // SAFETY: the call reads `priority`, which lives until it returns.
+        let result = unsafe { libc::sched_setscheduler(0, libc::SCHED_FIFO, &raw const priority) };
+        assert_eq!((result, Error::last_os_error().kind()), (-1, ErrorKind::PermissionDenied));
     });
 }
 

@@ -34,7 +34,7 @@ pub(super) fn vehicle(document: &Document) -> Result<Vehicle> {
     let root = TomlTable::root(document, entries.get_ref(), TABLES)?;
     Ok(Vehicle {
         identity: part(&root, "vehicle", &["name", "labels"], identity)?,
-        network: part(&root, "network", &["domain", "interfaces"], network)?,
+        network: part(&root, "network", &["domain", "interfaces", "real_time"], network)?,
         limits: limits(root.get("limits").as_ref(), Limits::MAX)?,
         inference: part(&root, "inference", &["memory", "run_max", "load_max"], inference)?,
         recording: part(
@@ -94,6 +94,7 @@ fn network(table: &TomlTable) -> Result<NetworkSettings> {
     Ok(NetworkSettings {
         domain: domain.and_then(|domain| u16::try_from(domain).ok()),
         interfaces: interfaces.transpose()?.unwrap_or_default(),
+        real_time: table.flag("real_time")?,
     })
 }
 

@@ -147,6 +147,7 @@ fn spec(
 ) -> SupervisionSpec {
     let domain = vehicle.network.domain.map(|domain| format!("--domain={domain}"));
     let interfaces = vehicle.network.interfaces.iter().map(|it| format!("--interface={it}"));
+    let real_time = vehicle.network.real_time.then(|| "--real-time".to_owned());
     let recording = &vehicle.recording;
     SupervisionSpec {
         version: SUPERVISION_VERSION,
@@ -156,7 +157,7 @@ fn spec(
         clips: layout.clips(),
         vehicle: args.vehicle.clone(),
         signer: Some((layout.key(), name.to_string())),
-        network: domain.into_iter().chain(interfaces).collect(),
+        network: domain.into_iter().chain(interfaces).chain(real_time).collect(),
         all: args.all,
         decisions: vehicle.deployments.decisions.as_ref().map(ToString::to_string),
         commands: recording.commands.as_ref().map(ToString::to_string),

@@ -277,6 +277,9 @@ pub struct NetworkStatus {
     pub buffer_requested: usize,
     /// Granted size, in bytes.
     pub buffer_granted: usize,
+    /// Whether the ingress receives with real-time priority.
+    #[serde(default)]
+    pub real_time: bool,
     /// Number of datagrams that the system dropped because a buffer was full.
     pub socket_drops: u64,
     /// Number of harmful datagrams that the packet filter dropped, with excessive fragments or too

@@ -9,6 +9,7 @@ mod counted;
 mod faults;
 mod from_peers;
 mod graph;
+mod real_time;
 mod receiver;
 mod rtps;
 mod to_peers;
@@ -48,6 +49,7 @@ fn main() -> ExitCode {
         faults::CASES,
         together::CASES,
         counted::CASES,
+        real_time::CASES,
     ];
     let cases = || suites.into_iter().flatten();
     if let Ok(name) = std::env::var(CASE) {

@@ -30,6 +30,9 @@ pub(super) struct Args {
     /// Bytes of the largest sample, which sets the size of socket buffers.
     #[arg(long, value_name = "BYTES")]
     pub(super) largest: Option<usize>,
+    /// Receive with real-time priority, if the system permits it.
+    #[arg(long, conflicts_with = "drive")]
+    pub(super) real_time: bool,
     /// MCAP file, rosbag2 database or directory to play instead of the network; several are played
     /// as one.
     #[arg(long, value_name = "FILE|DIR")]
@@ -53,9 +56,14 @@ impl Args {
         self.clock_offset.map_or_else(Clock::from_time_of_day, Clock::new)
     }
 
+    /// Returns whether samples come from the network.
+    pub(super) fn is_of_network(&self) -> bool {
+        self.drive.is_empty()
+    }
+
     /// Returns the files that the process needs.
     pub(super) fn paths(&self) -> Paths {
-        if self.drive.is_empty() {
+        if self.is_of_network() {
             return Paths::default();
         }
         let unpack_in = self.unpack_in.clone().unwrap_or_else(std::env::temp_dir);
@@ -67,7 +75,7 @@ impl Args {
 
     /// Returns the sockets that the process may create once it has a source.
     pub(super) fn new_sockets(&self) -> NewSockets {
-        if self.drive.is_empty() { NewSockets::Udp } else { NewSockets::None }
+        if self.is_of_network() { NewSockets::Udp } else { NewSockets::None }
     }
 }
 

@@ -2,11 +2,13 @@
 //!
 //! - `args`: the command line.
 //! - `source`: the network or a drive.
+//! - `real_time`: priority over other programs, if it is permitted.
 //! - `network`: failures of the network, for users.
 //! - `topics`: lists the topics of the network, for `gleaner topics`.
 
 mod args;
 mod network;
+mod real_time;
 mod source;
 mod topics;
 
@@ -22,7 +24,7 @@ use gleaner_regions::TopicRegion;
 use gleaner_vitals::start::{reports, stop_socket};
 use gleaner_vitals::{ReportWriter, log};
 use rustix::process::{Signal, set_parent_process_death_signal};
-use tracing::debug;
+use tracing::{debug, warn};
 
 use crate::Ingress;
 use args::{Args, IngressCommand};
@@ -56,7 +58,9 @@ fn start(args: Args) -> Result<(), Failure> {
     let internal = |what: &'static str| {
         move |error: io::Error| Failure::caused_by(Exit::Internal, what, &error)
     };
-    // First: threads that exist already would keep their privileges.
+    // Before there are other threads, and before it is denied.
+    let real_time = args.real_time && enter_real_time();
+    // Threads that exist already would keep their privileges.
     let layers = sandbox::start(&args.paths());
     // A starter that dies also closes the control connection.
     set_parent_process_death_signal(Some(Signal::TERM))
@@ -68,7 +72,7 @@ fn start(args: Args) -> Result<(), Failure> {
     // Not without seals: a reader could change what others read.
     TopicRegion::create("gleaner-test", 1, 1).map_err(internal("cannot share samples"))?;
     let new_sockets = args.new_sockets();
-    let source = source::open(args)?;
+    let source = source::open(args, real_time)?;
     let layers = sandbox::close(layers, new_sockets).map_err(|error| {
         Failure::caused_by(Exit::Internal, "cannot close the sandbox of the ingress", &error)
     })?;
@@ -81,6 +85,17 @@ fn start(args: Args) -> Result<(), Failure> {
     let ended = ingress.run(control, Some(stop));
     writer.end();
     ended.map_err(internal("cannot wait for readers"))
+}
+
+/// Enters real time; returns whether this succeeded. A vehicle that may not goes on without it.
+fn enter_real_time() -> bool {
+    let entered = real_time::enter();
+    if let Err(error) = &entered {
+        let help = "it needs `ulimit -r 1` or CAP_SYS_NICE; in a service, `LimitRTPRIO=1` and \
+                    `RestrictRealtime=no`";
+        warn!(%error, help, "the system refuses real-time priority");
+    }
+    entered.is_ok()
 }
 
 /// Receives the control connection over standard input, the socket of the starter.

@@ -8,9 +8,10 @@ use gleaner_transport::LiveSource;
 use super::args::Args;
 use super::network::NetworkError;
 
-pub(super) fn open(args: Args) -> Result<Box<dyn LiveSource>, Failure> {
+/// Opens the source that `args` name. The process runs in real time, or not.
+pub(super) fn open(args: Args, real_time: bool) -> Result<Box<dyn LiveSource>, Failure> {
     let clock = args.clock();
-    if !args.drive.is_empty() {
+    if !args.is_of_network() {
         let options = DriveOptions { unpack_in: args.unpack_in, ..DriveOptions::default() };
         let drive = DrivePlayer::open(&args.drive, &options, clock, args.rate);
         return Ok(Box::new(drive.map_err(|error| unplayable(&error))?));
@@ -18,6 +19,7 @@ pub(super) fn open(args: Args) -> Result<Box<dyn LiveSource>, Failure> {
     let mut network = args.network.options(args.node).map_err(NetworkError::failure)?;
     network.largest = args.largest.unwrap_or(network.largest);
     network.clock = clock;
+    network.real_time = real_time;
     // Readers search their own files for definitions.
     network.messages = Vec::new();
     network.prefixes = Vec::new();
