@@ -52,7 +52,16 @@ pub fn run(lambda: &Path, out: &Path, args: &[&str]) -> RunningProgram {
 
 /// Starts `gleaner run` with built lambdas, reporting as JSON.
 pub fn run_all(lambdas: &[&Path], out: &Path, args: &[&str]) -> RunningProgram {
-    let mut gleaner = Command::new(program("gleaner"));
+    run_by(Command::new(program("gleaner")), lambdas, out, args)
+}
+
+/// Starts `gleaner run` as [`run_all`] does, by a command that ends with the program.
+pub fn run_by(
+    mut gleaner: Command,
+    lambdas: &[&Path],
+    out: &Path,
+    args: &[&str],
+) -> RunningProgram {
     gleaner.env("XDG_CACHE_HOME", root().join("target/test-cache"));
     gleaner.arg("run").args(lambdas).arg("--json").arg("--out").arg(out).args(args);
     RunningProgram::start(gleaner)

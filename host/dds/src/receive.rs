@@ -42,10 +42,11 @@ const UPDATE_MIN: Duration = Duration::from_millis(100);
 const UPDATE_MAX: Duration = Duration::from_secs(1);
 /// Shared memory for samples that is always kept.
 const SHARED_BYTES: usize = 1 << 20;
-/// Most bytes of a datagram.
-const DATAGRAM_BYTES: usize = 64 << 10;
 /// Most memory that is mapped before there are samples, for all topics together.
 const MOST_MAPPED: usize = 256 << 20;
+/// Size of the blocks in which it is mapped: the allocator keeps blocks of this size, and merges
+/// them.
+const MAPPED_BLOCK: usize = 1 << 20;
 
 /// A command to the receive thread.
 pub(super) enum ReceiverCommand {
@@ -92,8 +93,10 @@ struct Receiver {
     clock_watch: ClockWatch,
     /// Bytes of the largest sample in [`DdsOptions::largest`], whatever is subscribed so far.
     largest: usize,
-    /// Memory that may still be mapped before there are samples, in bytes.
-    unmapped: usize,
+    /// Whether memory is mapped before there are samples.
+    real_time: bool,
+    /// Bytes of that memory.
+    mapped: usize,
     /// True if something changed since the last update.
     changed: bool,
     updated: Option<Instant>,
@@ -130,7 +133,8 @@ pub(super) fn start(
         clock: options.clock,
         clock_watch: ClockWatch::new(options.time_of_day),
         largest: options.largest,
-        unmapped: if options.real_time { MOST_MAPPED } else { 0 },
+        real_time: options.real_time,
+        mapped: 0,
         changed: true,
         updated: None,
     };
@@ -203,8 +207,8 @@ impl Receiver {
         while let Ok(command) = self.commands.try_recv() {
             match command {
                 ReceiverCommand::Subscribe(reader) => {
-                    self.map_memory(reader.memory_needed());
                     self.readers.insert(reader.index(), *reader);
+                    self.map_memory();
                     // Its reader is created at once, not at the next change in the domain.
                     self.updated = None;
                 }
@@ -223,18 +227,18 @@ impl Receiver {
         true
     }
 
-    /// Maps memory for `count` samples of `bytes`, as far as there is some left to map, which the
-    /// allocator then reuses: a page is new to the process only once.
-    fn map_memory(&mut self, (count, bytes): (usize, usize)) {
-        // A sample in one datagram stays where it was received.
-        if bytes <= DATAGRAM_BYTES {
-            return;
+    /// Maps memory for the samples of all readers, if there is less, and frees it for the allocator
+    /// to reuse: a page is new to the process only once.
+    fn map_memory(&mut self) {
+        let each = self.readers.values().map(TopicReader::memory_needed);
+        let needed = each.fold(0, usize::saturating_add).min(MOST_MAPPED);
+        if self.real_time && needed > self.mapped {
+            self.mapped = needed;
+            // At once, since memory that is freed between would be mapped again and again. Zeros
+            // alone would not be written.
+            let blocks = (0..needed.div_ceil(MAPPED_BLOCK)).map(|_| vec![1_u8; MAPPED_BLOCK]);
+            drop(black_box(blocks.collect::<Vec<_>>()));
         }
-        let count = count.min(self.unmapped / bytes);
-        self.unmapped -= count * bytes;
-        // Zeros alone would not be written.
-        let samples: Vec<Vec<u8>> = (0..count).map(|_| vec![1; bytes]).collect();
-        drop(black_box(samples));
     }
 
     fn note_events(&mut self) {

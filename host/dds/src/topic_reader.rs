@@ -83,6 +83,8 @@ pub(super) fn index(token: Token) -> Option<usize> {
 /// Times the memory of the samples that RustDDS keeps, with that of incomplete ones: those that
 /// their writer no longer has stay for 10 s.
 const WITH_INCOMPLETE: usize = 3;
+/// Most bytes of a datagram.
+const DATAGRAM_BYTES: usize = 64 << 10;
 
 /// Number of samples that RustDDS keeps for a topic.
 fn kept(spec: &TopicSpec) -> usize {
@@ -135,10 +137,12 @@ impl TopicReader {
         self.spec.max_bytes
     }
 
-    /// Returns the number of samples that are in memory at the same time, and the bytes of the
-    /// largest one.
-    pub(super) fn memory_needed(&self) -> (usize, usize) {
-        (WITH_INCOMPLETE * kept(&self.spec), self.spec.max_bytes)
+    /// Bytes of memory that its samples take besides that of received datagrams, in which small
+    /// samples stay.
+    pub(super) fn memory_needed(&self) -> usize {
+        let bytes = self.spec.max_bytes;
+        let samples = if bytes > DATAGRAM_BYTES { WITH_INCOMPLETE * kept(&self.spec) } else { 0 };
+        bytes.saturating_mul(samples)
     }
 
     pub(super) fn guid(&self) -> Option<GUID> {

@@ -28,6 +28,8 @@ enum Need {
     Peer(PeerKind),
     /// Rules that drop packets.
     Nft,
+    /// A program that takes real-time priority, and one that gives a capability up.
+    RealTime,
 }
 
 type CaseFn = fn() -> Result<(), Failed>;
@@ -89,6 +91,7 @@ fn unavailable(case: &DdsCase) -> Option<&'static str> {
     let missing = |need: &Need| match need {
         Need::Peer(kind) => kind.unavailable(),
         Need::Nft => (!can_filter()).then_some("cannot drop packets: nft is needed"),
+        Need::RealTime => real_time::unavailable(),
     };
     namespace::unavailable().or_else(|| case.needs.iter().find_map(missing))
 }

@@ -2,51 +2,114 @@
 
 use std::collections::BTreeSet;
 use std::fs;
-use std::process::Command;
+use std::process::{Command, Stdio};
 
-use gleaner_tests::live::{descendants, run};
+use gleaner_tests::live::{RunningProgram, descendants, program, run, run_all, run_by};
 use gleaner_tests::{TempFolder, root};
 use libtest_mimic::Failed;
 
-use crate::DdsCase;
+use crate::{DdsCase, Need};
 
-pub const CASES: &[DdsCase] =
-    &[DdsCase { name: "the_ingress_alone_has_real_time_priority", needs: &[], run: ingress_alone }];
+pub const CASES: &[DdsCase] = &[
+    DdsCase {
+        name: "the_ingress_alone_has_real_time_priority",
+        needs: &[Need::RealTime],
+        run: ingress_alone,
+    },
+    DdsCase {
+        name: "memory_for_images_is_mapped_before_they_arrive",
+        needs: &[Need::RealTime],
+        run: memory_is_mapped,
+    },
+    DdsCase {
+        name: "without_the_permission_the_ingress_warns_and_receives",
+        needs: &[Need::RealTime],
+        run: not_permitted,
+    },
+];
 
 /// Policies of `sched(7)`, as `/proc/PID/stat` has them.
 const NORMAL: &str = "0";
 const FIFO: &str = "1";
+
+/// A program without the capability to take real-time priority.
+const WITHOUT: [&str; 2] = ["--bounding-set", "-sys_nice"];
+
+pub fn unavailable() -> Option<&'static str> {
+    let succeeds = |command: &mut Command| {
+        let status = command.stdin(Stdio::null()).stderr(Stdio::null()).status();
+        status.is_ok_and(|status| status.success())
+    };
+    let takes = ["chrt", "-f", "1", "true"];
+    let permitted = succeeds(Command::new(takes[0]).args(&takes[1..]));
+    let denied = !succeeds(Command::new("setpriv").args(WITHOUT).args(takes))
+        && succeeds(Command::new("setpriv").args(WITHOUT).arg("true"));
+    (!permitted || !denied).then_some("cannot take real-time priority, and give it up by setpriv")
+}
 
 fn ingress_alone() -> Result<(), Failed> {
     let out = TempFolder::new();
     let lambda = root().join("tests/lambdas/ticker/python");
     let running = run(&lambda, out.path(), &["--no-record", "--real-time"]);
     running.until_ready();
-    let permitted = Command::new("chrt").args(["-f", "1", "true"]).status()?.success();
-    let of = |name: &str| -> BTreeSet<String> {
-        let processes = descendants(running.pid(), name);
-        processes.iter().flat_map(|pid| policies(*pid)).collect()
-    };
-    let expected = if permitted { FIFO } else { NORMAL };
-    let (ingress, shim) = (of("gleaner-ingress"), descendants(running.pid(), "gleaner-shim"));
-    assert_eq!(ingress, BTreeSet::from([expected.to_owned()]));
-    assert!(!shim.is_empty(), "a lambda has a shim");
+    let mut names = BTreeSet::new();
     for pid in descendants(running.pid(), "") {
-        let limits = fs::read_to_string(format!("/proc/{pid}/limits")).unwrap_or_default();
-        let name = fs::read_to_string(format!("/proc/{pid}/comm")).unwrap_or_default();
-        if name.trim_end() != "gleaner-ingress" {
-            assert!(policies(pid).is_subset(&BTreeSet::from([NORMAL.to_owned()])), "{name}");
-        }
-        let priority = limits.lines().find(|line| line.starts_with("Max realtime priority"));
-        let zero = priority.is_none_or(|line| line.split_whitespace().nth(3) == Some("0"));
-        assert!(zero, "{name}: {priority:?}");
+        let process = |file| fs::read_to_string(format!("/proc/{pid}/{file}")).unwrap();
+        let name = process("comm").trim_end().to_owned();
+        let policy = if name == "gleaner-ingress" { FIFO } else { NORMAL };
+        assert_eq!(policies(pid), BTreeSet::from([policy.to_owned()]), "{name}");
+        let limits = process("limits");
+        let limit = limits.lines().find(|line| line.starts_with("Max realtime priority"));
+        assert_eq!(limit.unwrap().split_whitespace().nth(3), Some("0"), "{name}");
+        names.insert(name);
     }
+    for name in ["gleaner-ingress", "gleaner-shim"] {
+        assert!(names.contains(name), "{names:?}");
+    }
+    assert!(until_end(running, 0), "the status has the priority");
+    Ok(())
+}
+
+/// Topics that together need more than the most that is mapped: 192 MiB for each.
+fn memory_is_mapped() -> Result<(), Failed> {
+    let out = TempFolder::new();
+    let lambdas = ["slow", "pixels"].map(|name| root().join(format!("tests/lambdas/{name}/python")));
+    let lambdas = [&*lambdas[0], &*lambdas[1]];
+    let running = run_all(&lambdas, out.path(), &["--no-record", "--real-time"]);
+    running.until_ready();
+    let [ingress] = descendants(running.pid(), "gleaner-ingress")[..] else {
+        return Err("there is one ingress".into());
+    };
+    let status = fs::read_to_string(format!("/proc/{ingress}/status"))?;
+    let anonymous = status.lines().find_map(|line| line.strip_prefix("RssAnon:")).unwrap();
+    let mib = anonymous.trim().trim_end_matches(" kB").parse::<u64>()? >> 10;
+    assert!((256..320).contains(&mib), "{mib} MiB");
     running.signal("INT");
     let finished = running.finish();
     assert!(finished.status.success(), "{}", finished.stderr);
-    assert_eq!(finished.ended().network.real_time, permitted);
-    assert_eq!(finished.stderr.contains("refuses real-time priority"), !permitted);
     Ok(())
+}
+
+fn not_permitted() -> Result<(), Failed> {
+    let out = TempFolder::new();
+    let lambda = root().join("tests/lambdas/ticker/python");
+    let mut gleaner = Command::new("setpriv");
+    gleaner.args(WITHOUT).arg(program("gleaner"));
+    let running = run_by(gleaner, &[&lambda], out.path(), &["--no-record", "--real-time"]);
+    running.until_ready();
+    assert!(!until_end(running, 1), "the status has no priority");
+    Ok(())
+}
+
+/// Ends the program; returns whether its last status has real-time priority. There were `warnings`
+/// that it is refused.
+fn until_end(running: RunningProgram, warnings: usize) -> bool {
+    running.signal("INT");
+    let finished = running.finish();
+    assert!(finished.status.success(), "{}", finished.stderr);
+    let refused = finished.stderr.matches("refuses real-time priority").count();
+    assert_eq!(refused, warnings, "{}", finished.stderr);
+    finished.ended().network.real_time
 }
 
 /// The scheduling policies of the threads of a process.

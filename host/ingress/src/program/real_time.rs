@@ -12,10 +12,13 @@ use libc::c_int;
 
 /// The lowest real-time priority.
 const PRIORITY: c_int = 1;
-/// Most freed memory that stays in the process.
+/// Freed memory at the end of the heap that is so large is given back to the system, except `KEPT`.
 #[cfg(target_env = "gnu")]
-const MOST_KEPT: c_int = 512 << 20;
-/// Blocks of this size and larger are not kept. glibc accepts no larger number.
+const LEAST_TRIMMED: c_int = 512 << 20;
+/// As much as topics map before their first sample.
+#[cfg(target_env = "gnu")]
+const KEPT: c_int = 256 << 20;
+/// Blocks of this size and larger are not kept. Some versions of glibc accept no larger number.
 #[cfg(target_env = "gnu")]
 const LEAST_MAPPED: c_int = 32 << 20;
 
@@ -35,13 +38,14 @@ pub(super) fn enter() -> io::Result<()> {
     Ok(())
 }
 
-/// Lets all threads share one heap, which does not shrink as samples are freed.
+/// Lets all threads share one heap, which keeps the memory of freed samples.
 fn keep_memory() {
     #[cfg(target_env = "gnu")]
     for (parameter, value) in [
         (libc::M_ARENA_MAX, 1),
         (libc::M_MMAP_THRESHOLD, LEAST_MAPPED),
-        (libc::M_TRIM_THRESHOLD, MOST_KEPT),
+        (libc::M_TRIM_THRESHOLD, LEAST_TRIMMED),
+        (libc::M_TOP_PAD, KEPT),
     ] {
         // SAFETY: `mallopt` takes two numbers by value and locks what it changes. It fails only
         // for an unknown parameter or value, and then nothing has changed.
