@@ -57,7 +57,7 @@ pub struct RttOptions {
     /// there are others [default: all run on all].
     #[arg(long, value_name = "LIST", value_parser = cores_of_sides)]
     cpus: Option<CoreList>,
-    /// Lambdas receive with real-time priority, as by `gleaner run --real-time`.
+    /// Lambdas also run with real-time priority of what receives, as by `gleaner run --real-time`.
     #[arg(long)]
     real_time: bool,
 }

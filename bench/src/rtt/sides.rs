@@ -120,7 +120,7 @@ impl Side {
         // The last answers may still be on their way.
         sleep(Duration::from_millis(500));
         received.extend(answers.take());
-        self.end(running, &mut facts);
+        self.end(running, &mut facts)?;
         let stamp = |answer: &RttAnswer| answer.at_ns - answer.ns as i64;
         let from = stamp(&received[0]) + i64::from(warm_up) * 1_000_000_000;
         let counted = received.iter().filter(|answer| stamp(answer) >= from);
@@ -160,8 +160,13 @@ impl Side {
         }
     }
 
-    /// Ends a side, and adds what it states at its end.
-    fn end(&mut self, running: RunningSide, facts: &mut BTreeMap<String, String>) {
+    /// Ends a side, and adds what it states at its end. Fails for a lambda whose ingress was to have
+    /// real-time priority, and may not.
+    fn end(
+        &mut self,
+        running: RunningSide,
+        facts: &mut BTreeMap<String, String>,
+    ) -> Result<(), String> {
         match running {
             RunningSide::Bare(reader) => reader.stop(),
             RunningSide::Lambda(started, _out) => {
@@ -172,11 +177,10 @@ impl Side {
                 let live = finished.ended();
                 let granted = live.network.buffer_granted;
                 facts.insert("socket buffer, B".to_owned(), granted.to_string());
-                if live.network.real_time {
-                    let stack = "RustDDS, in gleaner-ingress, in real time";
-                    facts.insert("stack".to_owned(), stack.to_owned());
-                }
                 if let Self::Lambda(side) = self {
+                    if side.real_time && !live.network.real_time {
+                        return Err("real-time priority is not permitted here".to_owned());
+                    }
                     side.last = Some(live);
                 }
             }
@@ -186,6 +190,7 @@ impl Side {
                 assert!(finished.status.success(), "{}", finished.stderr);
             }
         }
+        Ok(())
     }
 
     /// Adds the times of the stages of a lambda, in its last turn. Goals are for small samples: an

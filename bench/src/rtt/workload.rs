@@ -128,19 +128,22 @@ impl Workload {
         }
     }
 
-    /// Returns all sides. `buffer` is the limit of socket buffers; lambdas receive in real time if
-    /// `real_time`.
+    /// Returns all sides. `buffer` is the limit of socket buffers. With `real_time`, the lambdas run
+    /// a second time, and receive with real-time priority.
     pub(super) fn sides(self, buffer: u64, real_time: bool) -> Vec<Side> {
-        let lambda = |name: &str, kind, lambda| {
-            let name = name.to_owned();
+        let lambda = |name: String, kind, lambda, real_time| {
             Side::Lambda(Box::new(LambdaSide { name, kind, lambda, real_time, last: None }))
         };
-        let twins = [Twin::Rust, Twin::Python]
-            .map(|kind| lambda(&kind.to_string(), kind, self.lambda(kind)));
+        let kinds = [Twin::Rust, Twin::Python];
+        let twins = kinds.map(|kind| lambda(kind.to_string(), kind, self.lambda(kind), false));
+        let kinds = if real_time { &kinds[..] } else { &[] };
+        let prioritized = kinds
+            .iter()
+            .map(|&kind| lambda(format!("{kind}, in real time"), kind, self.lambda(kind), true));
         // The same decision where the lambda computes what the host does otherwise.
         let by_kernel = self.is_brake_dark().then(|| {
             let copy = copy_on_player("bench/lambdas/brake-dark-kernel/rust");
-            lambda("wasm, SDK kernel", Twin::Rust, copy)
+            lambda("wasm, SDK kernel".to_owned(), Twin::Rust, copy, false)
         });
         let [stand_in, rclpy] = [NodeKind::StandIn, NodeKind::Rclpy];
         let usual = NodeSide::DEPTH;
@@ -151,7 +154,13 @@ impl Workload {
         };
         let nodes =
             nodes.into_iter().map(|(kind, depth)| Side::Node(NodeSide { kind, depth, buffer }));
-        [Side::Bare].into_iter().chain(twins).chain(by_kernel).chain(nodes).collect()
+        [Side::Bare]
+            .into_iter()
+            .chain(twins)
+            .chain(by_kernel)
+            .chain(prioritized)
+            .chain(nodes)
+            .collect()
     }
 
     /// Returns a copy of the lambda, on the topics of the player.

@@ -73,7 +73,8 @@ fn ingress_alone() -> Result<(), Failed> {
 /// Topics that together need more than the most that is mapped: 192 MiB for each.
 fn memory_is_mapped() -> Result<(), Failed> {
     let out = TempFolder::new();
-    let lambdas = ["slow", "pixels"].map(|name| root().join(format!("tests/lambdas/{name}/python")));
+    let lambdas =
+        ["slow", "pixels"].map(|name| root().join(format!("tests/lambdas/{name}/python")));
     let lambdas = [&*lambdas[0], &*lambdas[1]];
     let running = run_all(&lambdas, out.path(), &["--no-record", "--real-time"]);
     running.until_ready();
