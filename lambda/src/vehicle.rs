@@ -47,7 +47,7 @@ pub struct NetworkSettings {
     pub domain: Option<u16>,
     /// Addresses of the network interfaces; without any, all.
     pub interfaces: Vec<IpAddr>,
-    /// Whether topics are received with real-time priority, where the system permits it.
+    /// True to receive topics with real-time priority, where the system permits it.
     pub real_time: bool,
 }
 

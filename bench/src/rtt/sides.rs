@@ -38,7 +38,7 @@ pub(super) struct LambdaSide {
     pub(super) name: String,
     pub(super) kind: Twin,
     pub(super) lambda: LambdaCopy,
-    /// Whether its topics are received with real-time priority.
+    /// True if its topics are received with real-time priority.
     pub(super) real_time: bool,
     pub(super) last: Option<LiveStatus>,
 }

@@ -38,7 +38,7 @@ pub struct DdsOptions {
     /// Bytes of the largest sample, which sets the size of socket buffers; 0 if no samples are to
     /// be received.
     pub largest: usize,
-    /// Whether this process runs in real time and keeps the memory that it frees: then memory for
+    /// True if this process runs in real time and keeps the memory that it frees: then memory for
     /// samples is mapped before the first one.
     pub real_time: bool,
     /// Folders with message definitions, searched first.

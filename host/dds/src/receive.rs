@@ -93,7 +93,7 @@ struct Receiver {
     clock_watch: ClockWatch,
     /// Bytes of the largest sample in [`DdsOptions::largest`], whatever is subscribed so far.
     largest: usize,
-    /// Whether memory is mapped before there are samples.
+    /// True if memory is mapped before there are samples.
     real_time: bool,
     /// Bytes of that memory.
     mapped: usize,

@@ -277,7 +277,7 @@ pub struct NetworkStatus {
     pub buffer_requested: usize,
     /// Granted size, in bytes.
     pub buffer_granted: usize,
-    /// Whether the ingress receives with real-time priority.
+    /// True if the ingress receives with real-time priority.
     #[serde(default)]
     pub real_time: bool,
     /// Number of datagrams that the system dropped because a buffer was full.

@@ -95,6 +95,12 @@ pub fn number_attribute(name: &str, number: i64) -> Proto {
     Proto::default().text(1, name).number(3, number).number(20, 2)
 }
 
+/// Returns an attribute that is a list of numbers.
+pub fn numbers_attribute(name: &str, numbers: &[i64]) -> Proto {
+    let attribute = Proto::default().text(1, name);
+    numbers.iter().fold(attribute, |proto, number| proto.number(8, *number)).number(20, 7)
+}
+
 /// Returns a constant.
 pub fn constant(name: &str, element: i64, shape: &[i64], bytes: &[u8]) -> Proto {
     let dimensions = shape.iter().fold(Proto::default(), |proto, length| proto.number(1, *length));
