@@ -160,7 +160,7 @@ impl Side {
         }
     }
 
-    /// Ends a side, and adds what it states at its end. Fails for a lambda whose ingress was to have
+    /// Ends a side, and adds what it states at its end. Fails for a lambda that was to receive with
     /// real-time priority, and may not.
     fn end(
         &mut self,

@@ -128,8 +128,8 @@ impl Workload {
         }
     }
 
-    /// Returns all sides. `buffer` is the limit of socket buffers. With `real_time`, the lambdas run
-    /// a second time, and receive with real-time priority.
+    /// Returns all sides. `buffer` is the limit of socket buffers. With `real_time`, there are
+    /// lambdas that receive with real-time priority, too.
     pub(super) fn sides(self, buffer: u64, real_time: bool) -> Vec<Side> {
         let lambda = |name: String, kind, lambda, real_time| {
             Side::Lambda(Box::new(LambdaSide { name, kind, lambda, real_time, last: None }))

@@ -3,9 +3,11 @@
 use std::collections::BTreeSet;
 use std::fs;
 use std::process::{Command, Stdio};
+use std::thread::sleep;
+use std::time::{Duration, Instant};
 
-use gleaner_tests::live::{RunningProgram, descendants, program, run, run_all, run_by};
-use gleaner_tests::{TempFolder, root};
+use gleaner_tests::live::{PATIENCE, RunningProgram, descendants, run, run_all, run_by};
+use gleaner_tests::{TempFolder, program, root};
 use libtest_mimic::Failed;
 
 use crate::{DdsCase, Need};
@@ -77,14 +79,22 @@ fn memory_is_mapped() -> Result<(), Failed> {
         ["slow", "pixels"].map(|name| root().join(format!("tests/lambdas/{name}/python")));
     let lambdas = [&*lambdas[0], &*lambdas[1]];
     let running = run_all(&lambdas, out.path(), &["--no-record", "--real-time"]);
-    running.until_ready();
+    running.until_all_ready(2);
     let [ingress] = descendants(running.pid(), "gleaner-ingress")[..] else {
         return Err("there is one ingress".into());
     };
-    let status = fs::read_to_string(format!("/proc/{ingress}/status"))?;
-    let anonymous = status.lines().find_map(|line| line.strip_prefix("RssAnon:")).unwrap();
-    let mib = anonymous.trim().trim_end_matches(" kB").parse::<u64>()? >> 10;
-    assert!((256..320).contains(&mib), "{mib} MiB");
+    let mapped = || {
+        let status = fs::read_to_string(format!("/proc/{ingress}/status")).unwrap();
+        let kb = status.lines().find_map(|line| line.strip_prefix("RssAnon:")).unwrap();
+        kb.trim().trim_end_matches(" kB").parse::<u64>().unwrap() >> 10
+    };
+    // A topic may be subscribed to after `init` has returned.
+    let deadline = Instant::now() + PATIENCE;
+    while mapped() < 256 {
+        assert!(Instant::now() < deadline, "{} MiB", mapped());
+        sleep(Duration::from_millis(20));
+    }
+    assert!(mapped() < 320, "{} MiB", mapped());
     running.signal("INT");
     let finished = running.finish();
     assert!(finished.status.success(), "{}", finished.stderr);
@@ -102,9 +112,10 @@ fn not_permitted() -> Result<(), Failed> {
     Ok(())
 }
 
-/// Ends the program; returns whether its last status has real-time priority. There were `warnings`
-/// that it is refused.
+/// Ends the program after a status of its network; returns whether that has real-time priority.
+/// There were `warnings` that it is refused.
 fn until_end(running: RunningProgram, warnings: usize) -> bool {
+    running.until_live("a status of the network", |live| live.network.buffer_granted > 0);
     running.signal("INT");
     let finished = running.finish();
     assert!(finished.status.success(), "{}", finished.stderr);

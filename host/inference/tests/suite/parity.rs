@@ -42,7 +42,8 @@ fn largest(values: &[f32]) -> f64 {
     values.iter().fold(0.0, |most, value| most.max(f64::from(value.abs())))
 }
 
-/// Runs a model several times; prints the median time and returns its output.
+/// Runs a model several times, prints the median time, and returns its output. If rten refuses it,
+/// or there is no ONNX Runtime, there is none.
 fn run(name: &str, reference: &Value, provider: &str, threads: u32) -> Option<Vec<f32>> {
     let bytes = std::fs::read(shared(&format!("models/{name}"))?).unwrap();
     let mut args = vec!["--memory".to_owned(), "4000000000".to_owned()];
@@ -56,8 +57,7 @@ fn run(name: &str, reference: &Value, provider: &str, threads: u32) -> Option<Ve
     let mut lambda = program.lambda("parity", &[model]);
     let opened = match lambda.open("m") {
         Ok(opened) => opened,
-        Err(fault) if fault.message.contains("lacks VNNI") => {
-            println!("skipped: {}", fault.message);
+        Err(fault) if fault.message.contains("`ConvInteger`") && provider == "rten" => {
             return None;
         }
         Err(fault) => panic!("{name}: {}", fault.message),
@@ -130,8 +130,8 @@ fn quantized_models_find_the_same_objects() {
     for name in ["yolo11n_int8_320.onnx", "yolov8n_int8_640.onnx"] {
         let reference = &references["models"][name];
         let boxes = reference["outputs"][0]["shape"][2].as_u64().unwrap() as usize;
-        for (provider, threads) in [("onnxruntime", 1), ("rten", 1), ("rten", 2)] {
-            let Some(values) = run(name, reference, provider, threads) else { continue };
+        assert_eq!(run(name, reference, "rten", 1), None, "rten refuses it");
+        if let Some(values) = run(name, reference, "onnxruntime", 1) {
             let best = best_scores(&values, boxes);
             let detections = reference["decoded_detections_on_source_image"].as_array().unwrap();
             let mut seen = std::collections::HashSet::new();
@@ -141,7 +141,7 @@ fn quantized_models_find_the_same_objects() {
                 if seen.insert(class) {
                     let expected = detection["score"].as_f64().unwrap() as f32;
                     let found = best[class];
-                    println!("{name}: {provider}: class {class}: {found} for {expected}");
+                    println!("{name}: class {class}: {found} for {expected}");
                     assert!((found - expected).abs() <= 0.05, "{name}: {found} for {expected}");
                 }
             }
