@@ -179,13 +179,17 @@ mod tests {
     use crate::inspect::inspect;
     use crate::onnx::{INT8, INT32, UINT8, constant, graph, model, node, numbers_attribute, value};
 
-    /// A product of two 8-bit matrices with the largest values.
-    fn product() -> Vec<u8> {
+    const ZERO_POINTS: [(&str, i32); 2] = [("za", 10), ("zb", 128)];
+
+    /// A product of two 8-bit matrices with zero points.
+    fn product([rows, inner, columns]: [i64; 3]) -> Vec<u8> {
+        let zero_points =
+            ZERO_POINTS.map(|(name, value)| constant(name, UINT8, &[], &[value as u8]));
         model(&graph(
-            &[node("MatMulInteger", &["a", "b"], &["y"], &[])],
-            &[],
-            &[value("a", UINT8, &[8, 64]), value("b", UINT8, &[64, 32])],
-            &[value("y", INT32, &[8, 32])],
+            &[node("MatMulInteger", &["a", "b", "za", "zb"], &["y"], &[])],
+            &zero_points,
+            &[value("a", UINT8, &[rows, inner]), value("b", UINT8, &[inner, columns])],
+            &[value("y", INT32, &[rows, columns])],
         ))
     }
 
@@ -237,22 +241,38 @@ mod tests {
 
     #[test]
     fn products_of_8_bit_integers_are_exact_or_refused() {
-        let bytes = product();
-        let loaded = with_options(&bytes, |options| RtenBackend.load(bytes.clone(), options));
-        let mut graph = match loaded {
-            Ok(graph) => graph,
-            Err(error) => {
-                assert!(products_saturate(), "{error}");
-                return assert!(error.to_string().contains("`MatMulInteger`"), "{error}");
-            }
-        };
-        let input = |shape: [u32; 2]| TensorValue {
-            element: Element::Uint8,
-            shape: shape.to_vec(),
-            bytes: vec![255; (shape[0] * shape[1]) as usize],
-        };
-        let inputs = [input([8, 64]), input([64, 32])];
-        let outputs = graph.run(&inputs, &StopSignal::default()).unwrap();
-        assert_eq!(outputs[0].bytes, (64 * 255 * 255_i32).to_le_bytes().repeat(8 * 32));
+        // Multiples of the tiles of rten, and numbers that are none.
+        for shape in [[8, 64, 32], [7, 67, 33], [1, 18, 5], [1, 3, 1]] {
+            let bytes = product(shape);
+            let loaded = with_options(&bytes, |options| RtenBackend.load(bytes.clone(), options));
+            let mut graph = match loaded {
+                Ok(graph) => graph,
+                Err(error) => {
+                    assert!(products_saturate(), "{error}");
+                    return assert!(error.to_string().contains("`MatMulInteger`"), "{error}");
+                }
+            };
+            let [rows, inner, columns] = shape.map(|length| length as usize);
+            let matrix = |rows: usize, columns: usize| TensorValue {
+                element: Element::Uint8,
+                shape: vec![rows as u32, columns as u32],
+                // The largest value is among them.
+                bytes: (0..rows * columns).map(|index| 255 - (index * 37 % 251) as u8).collect(),
+            };
+            let (a, b) = (matrix(rows, inner), matrix(inner, columns));
+            let [za, zb] = ZERO_POINTS.map(|(_, value)| value);
+            let dot = |index: usize| -> i32 {
+                let (row, column) = (index / columns, index % columns);
+                let product = |k| {
+                    let a = i32::from(a.bytes[row * inner + k]) - za;
+                    a * (i32::from(b.bytes[k * columns + column]) - zb)
+                };
+                (0..inner).map(product).sum()
+            };
+            let expected: Vec<u8> =
+                (0..rows * columns).flat_map(|index| dot(index).to_le_bytes()).collect();
+            let outputs = graph.run(&[a.clone(), b.clone()], &StopSignal::default()).unwrap();
+            assert!(outputs[0].bytes == expected, "{shape:?}");
+        }
     }
 }
