@@ -33,13 +33,14 @@ pub(super) fn write(
     tree: &PackageTree,
     source: &PackageSource,
 ) -> Result<(), Failure> {
-    let help = "`cargo fetch` downloads all crates";
+    // Both download crates of other platforms, which no build here needed.
+    let help = "see the message of cargo above";
     let mut metadata = checkout.cargo();
-    metadata.args(["metadata", "--format-version=1", "--locked", "--offline"]);
+    metadata.args(["metadata", "--format-version=1", "--locked"]);
     let workspace: CargoMetadata = serde_json::from_str(&steps::output(&mut metadata, help)?)
         .map_err(|error| Failure::caused_by(Exit::Internal, "cannot parse the crates", &error))?;
     let mut linked = checkout.cargo();
-    linked.args(["tree", "--locked", "--offline", "--edges=normal", "--prefix=none"]);
+    linked.args(["tree", "--locked", "--edges=normal", "--prefix=none"]);
     linked.args(["--format={p}", "--target=all"]);
     let packages = source.cargo_packages.iter().copied().flatten();
     linked.args(packages.flat_map(|package| ["--package", package]));
