@@ -120,7 +120,7 @@ impl Side {
         // The last answers may still be on their way.
         sleep(Duration::from_millis(500));
         received.extend(answers.take());
-        self.end(running, &mut facts)?;
+        self.end(running, &mut facts);
         let stamp = |answer: &RttAnswer| answer.at_ns - answer.ns as i64;
         let from = stamp(&received[0]) + i64::from(warm_up) * 1_000_000_000;
         let counted = received.iter().filter(|answer| stamp(answer) >= from);
@@ -150,6 +150,13 @@ impl Side {
                 args.extend(side.real_time.then_some("--real-time"));
                 let started = run(side.lambda.path(), out.path(), &args);
                 started.until_ready();
+                if side.real_time {
+                    let has_network = |live: &LiveStatus| live.network.buffer_granted > 0;
+                    let live = started.until_live("a status of the network", has_network);
+                    if !live.network.real_time {
+                        return Err("real-time priority is not permitted here".to_owned());
+                    }
+                }
                 let stack = fact("stack", "RustDDS, in gleaner-ingress");
                 Ok((RunningSide::Lambda(started, out), [stack].into()))
             }
@@ -160,13 +167,8 @@ impl Side {
         }
     }
 
-    /// Ends a side, and adds what it states at its end. Fails for a lambda that was to receive with
-    /// real-time priority, and may not.
-    fn end(
-        &mut self,
-        running: RunningSide,
-        facts: &mut BTreeMap<String, String>,
-    ) -> Result<(), String> {
+    /// Ends a side, and adds what it states at its end.
+    fn end(&mut self, running: RunningSide, facts: &mut BTreeMap<String, String>) {
         match running {
             RunningSide::Bare(reader) => reader.stop(),
             RunningSide::Lambda(started, _out) => {
@@ -178,9 +180,6 @@ impl Side {
                 let granted = live.network.buffer_granted;
                 facts.insert("socket buffer, B".to_owned(), granted.to_string());
                 if let Self::Lambda(side) = self {
-                    if side.real_time && !live.network.real_time {
-                        return Err("real-time priority is not permitted here".to_owned());
-                    }
                     side.last = Some(live);
                 }
             }
@@ -190,7 +189,6 @@ impl Side {
                 assert!(finished.status.success(), "{}", finished.stderr);
             }
         }
-        Ok(())
     }
 
     /// Adds the times of the stages of a lambda, in its last turn. Goals are for small samples: an

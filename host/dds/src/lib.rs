@@ -60,6 +60,7 @@ use tracing::{info, warn};
 pub use arguments::NetworkArgs;
 pub use discovery::DomainTopic;
 pub use options::{DdsError, DdsOptions, Distro};
+pub use receive::MOST_MAPPED;
 pub use writer::TopicWriter;
 
 use announcer::{Announcements, Announcer};

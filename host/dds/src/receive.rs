@@ -42,8 +42,8 @@ const UPDATE_MIN: Duration = Duration::from_millis(100);
 const UPDATE_MAX: Duration = Duration::from_secs(1);
 /// Shared memory for samples that is always kept.
 const SHARED_BYTES: usize = 1 << 20;
-/// Most memory that is mapped before there are samples, for all topics together.
-const MOST_MAPPED: usize = 256 << 20;
+/// Most memory that is mapped before there are samples, for all topics together, in bytes.
+pub const MOST_MAPPED: usize = 256 << 20;
 /// Size of the blocks in which it is mapped: the allocator keeps blocks of this size, and merges
 /// them.
 const MAPPED_BLOCK: usize = 1 << 20;

@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 
 use gleaner_tests::live::{PATIENCE, RunningProgram, descendants, run, run_all, run_by};
 use gleaner_tests::{TempFolder, program, root};
+use gleaner_vitals::usage::ProcessUsage;
 use libtest_mimic::Failed;
 
 use crate::{DdsCase, Need};
@@ -37,6 +38,7 @@ const FIFO: &str = "1";
 /// A program without the capability to take real-time priority.
 const WITHOUT: [&str; 2] = ["--bounding-set", "-sys_nice"];
 
+/// Returns why cases that need [`Need::RealTime`] cannot run here, if they cannot.
 pub fn unavailable() -> Option<&'static str> {
     let succeeds = |command: &mut Command| {
         let status = command.stdin(Stdio::null()).stderr(Stdio::null()).status();
@@ -83,14 +85,10 @@ fn memory_is_mapped() -> Result<(), Failed> {
     let [ingress] = descendants(running.pid(), "gleaner-ingress")[..] else {
         return Err("there is one ingress".into());
     };
-    let mapped = || {
-        let status = fs::read_to_string(format!("/proc/{ingress}/status")).unwrap();
-        let kb = status.lines().find_map(|line| line.strip_prefix("RssAnon:")).unwrap();
-        kb.trim().trim_end_matches(" kB").parse::<u64>().unwrap() >> 10
-    };
-    // A topic may be subscribed to after `init` has returned.
+    let mapped = || ProcessUsage::of(Some(ingress)).expect("it runs").held >> 20;
+    // A topic may be subscribed to after `init` has returned. Page tables take less than 2 MiB.
     let deadline = Instant::now() + PATIENCE;
-    while mapped() < 256 {
+    while mapped() < 256 + 2 {
         assert!(Instant::now() < deadline, "{} MiB", mapped());
         sleep(Duration::from_millis(20));
     }

@@ -17,7 +17,7 @@ const PRIORITY: c_int = 1;
 const LEAST_TRIMMED: c_int = 512 << 20;
 /// As much as topics map before their first sample.
 #[cfg(target_env = "gnu")]
-const KEPT: c_int = 256 << 20;
+const KEPT: c_int = gleaner_dds::MOST_MAPPED as c_int;
 /// Blocks of this size and larger are not kept. Some versions of glibc accept no larger number.
 #[cfg(target_env = "gnu")]
 const LEAST_MAPPED: c_int = 32 << 20;
