@@ -252,6 +252,11 @@ mod tests {
                 "give a value from 0 to 232",
             ),
             (
+                "[network]\nreal_time = \"yes\"",
+                "vehicle.toml, line 2: `network.real_time` is a text",
+                "give true or false",
+            ),
+            (
                 "\n[limits]\nfule = 1",
                 "vehicle.toml, line 3: unknown key `fule` in [limits]",
                 "did you mean `fuel`?",

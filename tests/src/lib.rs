@@ -297,8 +297,8 @@ impl LambdaCopy {
         Self { folder }
     }
 
-    /// Copies the lambda in `lambda` as one called `name`, with a deadline that a busy machine
-    /// meets.
+    /// Copies the lambda in `lambda` as one called `name`; if it states a deadline, with one that a
+    /// busy machine meets.
     pub fn named(lambda: &str, name: &str) -> Self {
         Self::changed_and_named(lambda, name, |manifest| manifest)
     }

@@ -57,7 +57,7 @@ pub(crate) fn run(args: &DoctorArgs) -> Result<Exit, Failure> {
     findings.push(optional(&parts, "gleaner-player", "needed by `gleaner play`"));
     findings.push(python(&parts));
     findings.extend(isolation::findings(&parts));
-    findings.extend(network::findings());
+    findings.extend(network::findings(&parts));
     findings.extend(vehicle::findings());
     let text = findings.iter().map(if args.json { json_line::<Finding> } else { text });
     print(&text.collect::<String>())?;

@@ -2,7 +2,9 @@
 
 use std::fs;
 use std::net::Ipv4Addr;
+use std::process::Command;
 
+use gleaner_parts::Parts;
 use nix::ifaddrs::getifaddrs;
 use nix::net::if_::InterfaceFlags;
 
@@ -26,7 +28,7 @@ struct Interface {
     flags: InterfaceFlags,
 }
 
-pub(super) fn findings() -> Vec<Finding> {
+pub(super) fn findings(parts: &Parts) -> Vec<Finding> {
     let buffer = fs::read_to_string("/proc/sys/net/core/rmem_max");
     let filters = fs::read_to_string("/proc/sys/net/core/optmem_max");
     let routes = fs::read_to_string("/proc/net/route").unwrap_or_default();
@@ -36,6 +38,7 @@ pub(super) fn findings() -> Vec<Finding> {
     vec![
         socket_buffer(buffer.ok().and_then(|text| text.trim().parse().ok())),
         socket_filter(filters.ok().and_then(|text| text.trim().parse().ok())),
+        real_time(parts),
         discovery(&interfaces(), &routes, localhost_only),
         domain(std::env::var("ROS_DOMAIN_ID").ok().as_deref()),
     ]
@@ -44,7 +47,8 @@ pub(super) fn findings() -> Vec<Finding> {
 fn socket_buffer(max: Option<u64>) -> Finding {
     const SUBJECT: &str = "socket buffer";
     let help = format!(
-        "for images: `sysctl -w net.core.rmem_max={BUFFER_BYTES}`, and the same in /etc/sysctl.d"
+        "for images: `sysctl -w net.core.rmem_max={BUFFER_BYTES}`, and the same in /etc/sysctl.d; \
+         where that is not possible, `gleaner run --real-time`"
     );
     match max {
         None => Finding::warning(SUBJECT, "unknown limit", help),
@@ -74,6 +78,22 @@ fn socket_filter(max: Option<u64>) -> Finding {
             let found = "too little memory for the filter against fragment floods";
             Finding::warning(SUBJECT, found, help)
         }
+    }
+}
+
+/// Lets the ingress ask for the priority: limits, capabilities and control groups decide.
+fn real_time(parts: &Parts) -> Finding {
+    const SUBJECT: &str = "real time";
+    let ask = |path| Command::new(path).arg("real-time").output().map_err(|error| error.to_string());
+    let answer = parts.program("gleaner-ingress").map_err(|error| error.to_string()).and_then(ask);
+    match answer {
+        Ok(output) if output.status.success() => Finding::ok(SUBJECT, "permitted"),
+        // Few need it, so this is no warning.
+        Ok(_) => Finding::ok(
+            SUBJECT,
+            "not permitted; only `gleaner run --real-time` needs it, see docs/live.md",
+        ),
+        Err(why) => Finding::warning(SUBJECT, why, "build it again: cargo build --release"),
     }
 }
 

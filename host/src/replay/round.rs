@@ -190,7 +190,6 @@ pub(super) fn replay(
     };
     let SessionSetup { inputs, session, mut guest } =
         SessionSetup::load(&mut drive, &options.lambda, manifest, RunMode::Replay, load)?;
-    let started = Instant::now();
     let mut header = None;
     if results.journal.is_some() || recording.is_some() {
         let ConfiguredLambda { build, config, remaps, .. } = &options.lambda;
@@ -250,6 +249,7 @@ pub(super) fn replay(
     };
     replay_loop.write_log(&init_log)?;
 
+    let started = Instant::now();
     let ran = replay_loop.run(&mut drive);
     // Decisions up to an error are kept.
     let flushed = replay_loop.flush();

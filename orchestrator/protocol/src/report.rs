@@ -83,7 +83,7 @@ pub struct Round {
     pub wakes: u64,
     /// Wakes of this pass that ended in a fault.
     pub faults: u64,
-    /// Duration of this pass, in s.
+    /// Duration of this pass after `init` has returned, in s.
     pub wall_s: f64,
     /// Wakes of this pass per second of `wall_s`.
     pub wakes_per_s: f64,
@@ -133,7 +133,7 @@ pub struct ReplaySummary {
     /// The replayed part of the drive.
     #[serde(default, skip_serializing_if = "TimeRange::is_all")]
     pub part: TimeRange,
-    /// Duration of the replay, in s.
+    /// Duration of the replay after `init` has returned, in s.
     pub wall_s: f64,
     /// Time in the lambda's code, in s.
     pub run_s: f64,

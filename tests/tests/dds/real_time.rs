@@ -7,6 +7,7 @@ use std::thread::sleep;
 use std::time::{Duration, Instant};
 
 use gleaner_tests::live::{PATIENCE, RunningProgram, descendants, run, run_all, run_by};
+use gleaner_tests::vehicle::{TestVehicle, text};
 use gleaner_tests::{TempFolder, program, root};
 use gleaner_vitals::usage::ProcessUsage;
 use libtest_mimic::Failed;
@@ -28,6 +29,11 @@ pub const CASES: &[DdsCase] = &[
         name: "without_the_permission_the_ingress_warns_and_receives",
         needs: &[Need::RealTime],
         run: not_permitted,
+    },
+    DdsCase {
+        name: "the_ingress_of_a_vehicle_has_it_if_its_file_says_so",
+        needs: &[Need::RealTime],
+        run: of_a_vehicle,
     },
 ];
 
@@ -71,6 +77,7 @@ fn ingress_alone() -> Result<(), Failed> {
         assert!(names.contains(name), "{names:?}");
     }
     assert!(until_end(running, 0), "the status has the priority");
+    assert!(doctor_permits(Command::new(program("gleaner"))));
     Ok(())
 }
 
@@ -102,12 +109,42 @@ fn memory_is_mapped() -> Result<(), Failed> {
 fn not_permitted() -> Result<(), Failed> {
     let out = TempFolder::new();
     let lambda = root().join("tests/lambdas/ticker/python");
-    let mut gleaner = Command::new("setpriv");
-    gleaner.args(WITHOUT).arg(program("gleaner"));
-    let running = run_by(gleaner, &[&lambda], out.path(), &["--no-record", "--real-time"]);
+    let gleaner = || {
+        let mut gleaner = Command::new("setpriv");
+        gleaner.args(WITHOUT).arg(program("gleaner"));
+        gleaner
+    };
+    assert!(!doctor_permits(gleaner()));
+    let running = run_by(gleaner(), &[&lambda], out.path(), &["--no-record", "--real-time"]);
     running.until_ready();
     assert!(!until_end(running, 1), "the status has no priority");
     Ok(())
+}
+
+fn of_a_vehicle() -> Result<(), Failed> {
+    let mut vehicle = TestVehicle::new();
+    fs::write(vehicle.path("vehicle.toml"), "[network]\nreal_time = true\n").unwrap();
+    vehicle.start();
+    let deployed = vehicle.deploy(&root().join("tests/lambdas/ticker/rust"), &[]);
+    assert!(deployed.status.success(), "{}", text(&deployed));
+    vehicle.until_running(&["ticker"]);
+    let [ingress] = vehicle.processes("gleaner-ingress")[..] else {
+        return Err("there is one ingress".into());
+    };
+    assert_eq!(policies(ingress), BTreeSet::from([FIFO.to_owned()]));
+    vehicle.stop();
+    Ok(())
+}
+
+/// Returns whether `gleaner doctor` finds real-time priority permitted.
+fn doctor_permits(mut gleaner: Command) -> bool {
+    let output = gleaner.arg("doctor").stdin(Stdio::null()).output().unwrap();
+    let text = String::from_utf8(output.stdout).unwrap();
+    let line = text.lines().find(|line| line.contains("real time:")).expect("a finding");
+    let (_, detail) = line.split_once("real time: ").unwrap();
+    let denied = detail.starts_with("not permitted; only `gleaner run --real-time` needs it");
+    assert!(denied || detail == "permitted", "{text}");
+    !denied
 }
 
 /// Ends the program after a status of its network; returns whether that has real-time priority.

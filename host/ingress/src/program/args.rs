@@ -49,6 +49,8 @@ pub(super) struct Args {
 pub(super) enum IngressCommand {
     /// Reports the topics of the network, and ends.
     Topics(TopicsArgs),
+    /// Asks the system for real-time priority, and ends: with an error if it is refused.
+    RealTime,
 }
 
 impl Args {

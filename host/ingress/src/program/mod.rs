@@ -30,12 +30,20 @@ use crate::Ingress;
 use args::{Args, IngressCommand};
 use topics::TopicsArgs;
 
+/// What real-time priority needs.
+const REAL_TIME_HELP: &str = "it needs `ulimit -r 1` or CAP_SYS_NICE; in a service, \
+                              `LimitRTPRIO=1` and `RestrictRealtime=no`";
+
 /// Runs the program `gleaner-ingress`.
 pub fn main() -> ExitCode {
     log::init_service();
     let mut args = Args::parse();
     let ended = match args.command.take() {
         Some(IngressCommand::Topics(topics)) => list_topics(topics),
+        Some(IngressCommand::RealTime) => real_time::enter().map_err(|error| {
+            let what = "the system refuses real-time priority";
+            Failure::caused_by(Exit::Internal, what, &error).with_help(REAL_TIME_HELP)
+        }),
         None => start(args),
     };
     match ended {
@@ -91,9 +99,7 @@ fn start(args: Args) -> Result<(), Failure> {
 fn enter_real_time() -> bool {
     let entered = real_time::enter();
     if let Err(error) = &entered {
-        let help = "it needs `ulimit -r 1` or CAP_SYS_NICE; in a service, `LimitRTPRIO=1` and \
-                    `RestrictRealtime=no`";
-        warn!(%error, help, "the system refuses real-time priority");
+        warn!(%error, help = REAL_TIME_HELP, "the system refuses real-time priority");
     }
     entered.is_ok()
 }
