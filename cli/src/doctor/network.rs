@@ -84,7 +84,8 @@ fn socket_filter(max: Option<u64>) -> Finding {
 /// Lets the ingress ask for the priority: limits, capabilities and control groups decide.
 fn real_time(parts: &Parts) -> Finding {
     const SUBJECT: &str = "real time";
-    let ask = |path| Command::new(path).arg("real-time").output().map_err(|error| error.to_string());
+    let ask =
+        |path| Command::new(path).arg("real-time").output().map_err(|error| error.to_string());
     let answer = parts.program("gleaner-ingress").map_err(|error| error.to_string()).and_then(ask);
     match answer {
         Ok(output) if output.status.success() => Finding::ok(SUBJECT, "permitted"),

@@ -209,17 +209,13 @@ struct SlotHold<M> {
 
 impl<M> SlotHold<M> {
     fn with_headroom(&self) -> &[u8] {
-        let payload = self.slots.payload(self.index);
-        // SAFETY: the headroom and the `len` bytes after it are one initialised part of the region,
-        // and the hold of `self` keeps writers away until it is dropped.
-        unsafe { slice::from_raw_parts(payload.sub(HEADROOM).as_ptr(), HEADROOM + self.seal().len) }
+        // SAFETY: `self` owns a hold until it is dropped.
+        unsafe { self.slots.with_headroom(self.index) }
     }
 
     fn seal(&self) -> &Seal<M> {
-        let seal = &self.slots.slot(self.index).seal;
-        // SAFETY: the hold of `self` keeps the count above 0: the seal is initialised, visible
-        // since that count was read, and not written to until `self` is dropped.
-        seal.with(|seal| unsafe { (*seal).assume_init_ref() })
+        // SAFETY: `self` owns a hold until it is dropped.
+        unsafe { self.slots.seal(self.index) }
     }
 }
 

@@ -6,7 +6,12 @@
 //! slot, and frees it or drafts it again.
 #![allow(unsafe_code)]
 
-use std::{fmt, mem::MaybeUninit, ptr::NonNull};
+use std::{
+    fmt,
+    mem::{ManuallyDrop, MaybeUninit},
+    ptr::NonNull,
+    slice,
+};
 
 use crate::{
     Draft, DraftError, Lease, PoolError, Region,
@@ -80,6 +85,31 @@ impl<M> Slots<M> {
         // SAFETY: `Pool::new` checked that the region holds `slots` strides after `first`, and
         // `index < slots`.
         unsafe { self.first.add(index as usize * self.stride) }
+    }
+
+    /// Returns the seal of a slot.
+    ///
+    /// # Safety
+    ///
+    /// The caller owns a hold on the slot while it uses what is returned.
+    pub(crate) unsafe fn seal(&self, index: u32) -> &Seal<M> {
+        // SAFETY: the hold keeps the count above 0: the seal is initialised, visible since that
+        // count was read, and not written to before the hold ends.
+        self.slot(index).seal.with(|seal| unsafe { (*seal).assume_init_ref() })
+    }
+
+    /// Returns the [`HEADROOM`] bytes and the sample in a slot as one slice.
+    ///
+    /// # Safety
+    ///
+    /// The caller owns a hold on the slot while it uses what is returned.
+    pub(crate) unsafe fn with_headroom(&self, index: u32) -> &[u8] {
+        // SAFETY: the caller's promise.
+        let len = unsafe { self.seal(index) }.len;
+        let payload = self.payload(index);
+        // SAFETY: the headroom and the `len` bytes after it are one initialised part of the region,
+        // and the hold keeps writers away until it ends.
+        unsafe { slice::from_raw_parts(payload.sub(HEADROOM).as_ptr(), HEADROOM + len) }
     }
 
     /// Releases one hold; the last one frees the slot.
@@ -201,16 +231,38 @@ impl<M> Pool<M> {
     /// If it returns `None`, then all accesses before the slot lost that stamp are visible to the
     /// caller.
     pub(crate) fn pin(&self, index: u32, stamp: RingStamp) -> Option<Lease<M>> {
+        let _passed_on = ManuallyDrop::new(self.hold(index, stamp)?);
+        // SAFETY: that hold is never dropped, and goes to the lease.
+        Some(unsafe { Lease::new(Arc::clone(&self.0), index) })
+    }
+
+    /// Returns what `read` makes of the metadata and the bytes of a sample, as [`pin`](Self::pin)
+    /// finds it.
+    pub(crate) fn read<T>(
+        &self,
+        index: u32,
+        stamp: RingStamp,
+        read: impl FnOnce(&M, &[u8]) -> T,
+    ) -> Option<T> {
+        let hold = self.hold(index, stamp)?;
+        // SAFETY: `hold` is dropped after the call.
+        let (seal, bytes) = unsafe { (hold.slots.seal(index), hold.slots.with_headroom(index)) };
+        Some(read(&seal.meta, &bytes[HEADROOM..]))
+    }
+
+    fn hold(&self, index: u32, stamp: RingStamp) -> Option<BorrowedHold<'_, M>> {
         let one_more = |count| (1..MAX_HOLDS).contains(&count).then_some(count + 1);
         let count = &self.0.slot(index).count;
         // Acquire on success pairs with `Draft::sealed`; on failure, with what brought the count to
         // 0: `release` or `reclaim`.
         count.fetch_update(Ordering::Acquire, Ordering::Acquire, one_more).ok()?;
-        // SAFETY: the count was raised from above 0, and that hold goes to the lease.
-        let lease = unsafe { Lease::new(Arc::clone(&self.0), index) };
-        // The slot may have been sealed again after the caller read its index. Then the lease is on
+        // The count was raised from above 0, and that hold is the one of `hold`.
+        let hold = BorrowedHold { slots: &self.0, index };
+        // SAFETY: `hold` is dropped after this.
+        let found = unsafe { hold.slots.seal(index) }.stamp;
+        // The slot may have been sealed again after the caller read its index. Then the hold is on
         // another sample, and is dropped here.
-        (lease.stamp() == Some(stamp)).then_some(lease)
+        (found == Some(stamp)).then_some(hold)
     }
 
     /// Releases a hold that [`Draft::into_hold`] has left.
@@ -236,6 +288,19 @@ impl<M> Pool<M> {
         // SAFETY: the count is 0 and was lowered here, so this call owns the slot; the caller
         // checked `len`.
         Some(unsafe { Draft::new(Arc::clone(&self.0), index, len) })
+    }
+}
+
+/// One hold on a slot, which ends while its pool is borrowed.
+struct BorrowedHold<'a, M> {
+    slots: &'a Slots<M>,
+    index: u32,
+}
+
+impl<M> Drop for BorrowedHold<'_, M> {
+    fn drop(&mut self) {
+        // SAFETY: it owns one hold, which ends here.
+        unsafe { self.slots.release(self.index) }
     }
 }
 

@@ -6,7 +6,7 @@
 //! `head`, or knows that the sample was evicted.
 #![allow(unsafe_code)]
 
-use std::{error::Error, fmt};
+use std::{error::Error, fmt, ops::ControlFlow};
 
 use crate::{
     Draft, DraftError, Lease, Pool, PoolError, RingReader,
@@ -106,8 +106,17 @@ impl<M> RingState<M> {
         // That load of `head` shows the place as it was filled, or later. Acquire shows why the
         // sample left: see `newest_at`.
         let index = self.place(position).load(Ordering::Acquire);
-        let stamp = RingStamp { ring: self.id, position };
-        (index != EMPTY).then(|| self.pool.pin(index, stamp))?
+        (index != EMPTY).then(|| self.pool.pin(index, self.stamp(position)))?
+    }
+
+    /// As [`at`](Self::at), without a hold beyond the call of `read`.
+    fn read<T>(&self, position: u64, read: impl FnOnce(&M, &[u8]) -> T) -> Option<T> {
+        let index = self.place(position).load(Ordering::Acquire);
+        (index != EMPTY).then(|| self.pool.read(index, self.stamp(position), read))?
+    }
+
+    fn stamp(&self, position: u64) -> RingStamp {
+        RingStamp { ring: self.id, position }
     }
 
     /// Returns the newest sample below position `end`, and its position.
@@ -154,6 +163,41 @@ impl<M> RingState<M> {
             std::iter::once(newest).chain(older).take_while(|lease| keep(lease.meta())).take(max),
         );
         out.reverse();
+    }
+
+    /// Shows the samples of [`newest_while`](Self::newest_while) to `visit`, newest first, until
+    /// it breaks. None is held beyond its call.
+    pub(crate) fn visit_while(
+        &self,
+        end: u64,
+        max: usize,
+        mut keep: impl FnMut(&M) -> bool,
+        mut visit: impl FnMut(u64, &M, &[u8]) -> ControlFlow<()>,
+    ) {
+        if max == 0 {
+            return;
+        }
+        let Some((newest, position)) = self.newest_at(end) else {
+            return;
+        };
+        let mut show = |position, meta: &M, bytes: &[u8]| {
+            if keep(meta) { visit(position, meta, bytes) } else { ControlFlow::Break(()) }
+        };
+        if show(position, newest.meta(), &newest).is_break() {
+            return;
+        }
+        let oldest = (position + 1).saturating_sub(self.depth());
+        let mut left = max - 1;
+        for older in (oldest..position).rev() {
+            if left == 0 {
+                return;
+            }
+            let shown = self.read(older, |meta, bytes| show(older, meta, bytes));
+            left -= usize::from(shown.is_some());
+            if shown.is_some_and(|shown| shown.is_break()) {
+                return;
+            }
+        }
     }
 
     pub(crate) fn counts(&self) -> RingCounts {

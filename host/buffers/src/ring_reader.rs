@@ -1,6 +1,7 @@
 //! The reading end of a ring: over slots of this process, or over shared memory.
 
 use std::fmt;
+use std::ops::ControlFlow;
 
 use crate::{
     Lease, RingCounts,
@@ -172,6 +173,23 @@ impl<M> RingReader<M> {
         match &self.0 {
             RingKind::Heap(ring) => ring.newest_while(end, max, keep, out),
             RingKind::Shared(ring) => ring.newest_while(end, max, keep, out),
+        }
+    }
+
+    /// Shows the samples of [`RingReader::newest_while_before`] to `visit`, newest first, with
+    /// position, metadata and bytes, until it breaks.
+    ///
+    /// This costs less than leases; nothing is held afterwards.
+    pub fn visit_while_before(
+        &self,
+        end: u64,
+        max: usize,
+        keep: impl FnMut(&M) -> bool,
+        visit: impl FnMut(u64, &M, &[u8]) -> ControlFlow<()>,
+    ) {
+        match &self.0 {
+            RingKind::Heap(ring) => ring.visit_while(end, max, keep, visit),
+            RingKind::Shared(ring) => ring.visit_while(end, max, keep, visit),
         }
     }
 

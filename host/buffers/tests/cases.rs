@@ -2,6 +2,7 @@
 #![cfg(not(loom))]
 
 use std::collections::BTreeMap;
+use std::ops::ControlFlow;
 
 use gleaner_buffers::{HeapRegion, Pool, RingCounts, ring};
 use serde_json::{Value, json};
@@ -42,7 +43,15 @@ fn a_ring_answers_as_in_the_cases_of_the_rules() {
                     let since = if asked == "since" { call[1].as_i64().unwrap() } else { i64::MIN };
                     let most = if asked == "since" { 99 } else { given as usize };
                     reader.newest_while(most, |at_ns| *at_ns > since, &mut found);
-                    found.drain(..).map(|lease| json!(lease.position())).collect()
+                    let mut seen = Vec::new();
+                    let is_since = |at_ns: &i64| *at_ns > since;
+                    reader.visit_while_before(u64::MAX, most, is_since, |position, _, _| {
+                        seen.insert(0, Some(position));
+                        ControlFlow::Continue(())
+                    });
+                    let found: Vec<_> = found.drain(..).map(|lease| lease.position()).collect();
+                    assert_eq!(seen, found, "{}: call {n}, {call}", case["name"]);
+                    json!(found)
                 }
             };
             let wanted = call.as_array().unwrap().last().unwrap();

@@ -2,6 +2,8 @@
 #![allow(unsafe_code)]
 //! A ring over shared memory, through the interface of rings, and the words that its samples take.
 
+use std::ops::ControlFlow;
+
 use gleaner_buffers::shared::{
     ControlPage, HoldLimits, META_WORDS, SharedLayout, SharedReader, SharedWriter, in_process,
 };
@@ -37,6 +39,23 @@ fn publish(writer: &mut SharedWriter, count: u64) {
 fn value(lease: &Lease<u64>) -> u64 {
     assert_eq!(**lease, lease.meta().to_le_bytes());
     *lease.meta()
+}
+
+/// The samples that a visit of the ring shows, newest first; it breaks after `break_at` of them.
+fn seen(ring: &RingReader<u64>, end: u64, most: usize, least: u64, break_at: usize) -> Vec<u64> {
+    let mut seen = Vec::new();
+    ring.visit_while_before(
+        end,
+        most,
+        |value| *value >= least,
+        |position, value, bytes| {
+            assert_eq!(ring.meta(position), Some(*value));
+            assert_eq!(bytes, value.to_le_bytes());
+            seen.push(*value);
+            if seen.len() == break_at { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+        },
+    );
+    seen
 }
 
 fn values(leases: &[Lease<u64>]) -> Vec<u64> {
@@ -84,6 +103,22 @@ fn a_ring_shows_its_own_depth_of_a_deeper_topic() {
     assert!(all.is_empty(), "the newest one is refused");
     ring.last(0, &mut all);
     assert!(all.is_empty());
+}
+
+#[test]
+fn a_visit_shows_the_newest_samples_first_and_takes_no_word_afterwards() {
+    let (mut writer, reader) = topic();
+    let ring = ring(&reader, 0, 3);
+    publish(&mut writer, 5);
+    for _ in 0..9 {
+        assert_eq!(seen(&ring, u64::MAX, 9, 0, 9), [4, 3, 2]);
+        assert_eq!(seen(&ring, 4, 9, 0, 9), [3, 2]);
+        assert_eq!(seen(&ring, u64::MAX, 2, 0, 9), [4, 3]);
+        assert_eq!(seen(&ring, u64::MAX, 9, 3, 9), [4, 3]);
+        assert_eq!(seen(&ring, u64::MAX, 9, 0, 1), [4]);
+        assert!(seen(&ring, u64::MAX, 0, 0, 9).is_empty());
+    }
+    assert_eq!(ring.refused_holds(), 0);
 }
 
 #[test]
@@ -195,7 +230,19 @@ fn a_ring_continues_in_other_memory_and_keeps_the_earlier_samples_until_newer_on
     let all = |ring: &RingReader<u64>| {
         let mut all = Vec::new();
         ring.last(9, &mut all);
-        all.iter().map(|it| (*it.meta(), it.position().unwrap())).collect::<Vec<_>>()
+        let all: Vec<_> = all.iter().map(|it| (*it.meta(), it.position().unwrap())).collect();
+        let mut seen = Vec::new();
+        ring.visit_while_before(
+            u64::MAX,
+            9,
+            |_| true,
+            |position, meta, _| {
+                seen.insert(0, (*meta, position));
+                ControlFlow::Continue(())
+            },
+        );
+        assert_eq!(seen, all);
+        all
     };
     ring.continue_in(other, 2, 0, |words| words[0] + 1000);
     assert_eq!((ring.head(), ring.newest_meta()), (5, Some((4, 4))));

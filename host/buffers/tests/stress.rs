@@ -3,6 +3,7 @@
 #![cfg(not(loom))]
 
 use std::{
+    ops::ControlFlow,
     sync::atomic::{AtomicUsize, Ordering},
     thread,
 };
@@ -30,12 +31,26 @@ impl Meta {
 }
 
 fn check(lease: &Lease<Meta>, ring: u64) -> u64 {
-    let meta = *lease.meta();
+    check_bytes(lease.position(), lease.meta(), lease, ring)
+}
+
+fn check_bytes(position: Option<u64>, meta: &Meta, bytes: &[u8], ring: u64) -> u64 {
     assert_eq!(meta.ring, ring);
-    assert_eq!(lease.position(), Some(meta.position));
-    assert_eq!(lease.len(), meta.len());
-    assert!(lease.iter().all(|&byte| byte == meta.fill()));
+    assert_eq!(position, Some(meta.position));
+    assert_eq!(bytes.len(), meta.len());
+    assert!(bytes.iter().all(|&byte| byte == meta.fill()));
     meta.position
+}
+
+/// Checks the newest samples without leases, back to one whose position is a multiple of 5.
+fn visit(reader: &RingReader<Meta>, ring: u64) {
+    let mut last = u64::MAX;
+    let is_wanted = |meta: &Meta| !meta.position.is_multiple_of(5);
+    reader.visit_while_before(u64::MAX, 3, is_wanted, |position, meta, bytes| {
+        assert!(check_bytes(Some(position), meta, bytes, ring) < last, "newest first");
+        last = position;
+        ControlFlow::Continue(())
+    });
 }
 
 fn write_all(mut writer: RingWriter<Meta>, ring: u64) -> u64 {
@@ -63,6 +78,7 @@ fn read_all(reader: &RingReader<Meta>, ring: u64, turn: u64, writers: &AtomicUsi
     let mut newest = 0;
     for round in turn.. {
         let finished = writers.load(Ordering::Acquire) == 0;
+        visit(reader, ring);
         match round % 3 {
             0 => batch.clear(),
             1 => reader.last(3, &mut batch),

@@ -2,6 +2,7 @@
 //!
 //! Every number that a lambda passes is clamped here. No allocation exceeds the clamps.
 
+use std::ops::ControlFlow;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
@@ -58,8 +59,6 @@ pub struct Topic {
     /// Refused holds that were reported as a fault.
     reported_holds: AtomicU64,
     pub(super) look_back: LookBack,
-    /// Reused between column reads, so that they allocate nothing but their result.
-    scratch: Mutex<Vec<Lease<StoredMeta>>>,
     /// Curves of the values that are read, if they are recorded.
     curves: OnceLock<Arc<Curves>>,
 }
@@ -104,7 +103,6 @@ impl Topic {
             sums_before,
             reported_holds: AtomicU64::new(0),
             look_back: LookBack::default(),
-            scratch: Mutex::default(),
             curves: OnceLock::new(),
         })
     }
@@ -219,10 +217,7 @@ impl Topic {
     /// [`DataError::Malformed`]; [`DataError::OutOfTime`]; [`DataError::OutOfHolds`].
     pub fn column(self: &Arc<Self>, field: &Field, n: usize) -> Result<Column, DataError> {
         self.per_call.charge(|| self.column_work(field, n))?;
-        let until = self.until();
-        self.read_column(field, |reader, out| {
-            reader.last_before(until, n.min(self.per_call.items).min(self.depth), out)
-        })
+        self.read_column(field, n, |_| true)
     }
 
     /// Returns `field` of all samples received later than `since_ns`; at most `call_items` of
@@ -242,11 +237,7 @@ impl Topic {
         if field.walks() {
             self.per_call.charge(whole_ring)?;
         }
-        let until = self.until();
-        let is_since = |meta: &StoredMeta| meta.sample.at_ns > since_ns;
-        let column = self.read_column(field, |reader, out| {
-            reader.newest_while_before(until, self.per_call.items.min(self.depth), is_since, out)
-        });
+        let column = self.read_column(field, usize::MAX, |meta| meta.sample.at_ns > since_ns);
         if !field.walks() {
             let read = |column: &Column| column.values.len() * FIELD_BYTES;
             self.per_call.charge(|| column.as_ref().map_or_else(|_| whole_ring(), read))?;
@@ -254,33 +245,50 @@ impl Topic {
         column
     }
 
+    /// Reads `field` of the newest samples, at most `n`, back to the first one that `keep` refuses.
     fn read_column(
         self: &Arc<Self>,
         field: &Field,
-        select: impl FnOnce(&RingReader<StoredMeta>, &mut Vec<Lease<StoredMeta>>),
+        n: usize,
+        keep: impl FnMut(&StoredMeta) -> bool,
     ) -> Result<Column, DataError> {
         field.must_belong_to(self)?;
-        let mut leases = self.scratch.lock().unwrap_or_else(PoisonError::into_inner);
-        self.held(|| select(&self.reader, &mut leases))?;
-        self.look_back.at(leases.first());
-        let mut unchecked = 0;
-        let column =
-            leases.iter().try_fold(Column::with_capacity(leases.len()), |mut column, lease| {
-                unchecked += field.work(lease.len()).max(BYTES_PER_CHECK / SAMPLES_PER_CHECK);
-                if unchecked >= BYTES_PER_CHECK {
-                    unchecked = 0;
-                    self.per_call.due.check()?;
-                }
-                column.values.push(self.number(&field.path, lease)?);
-                column.at_ns.push(lease.meta().sample.at_ns);
-                Ok(column)
+        let most = n.min(self.per_call.items).min(self.depth);
+        let mut column = Column::with_capacity(most.min(SAMPLES_PER_CHECK));
+        let (mut unchecked, mut failed) = (0, None);
+        let add = |position, meta: &StoredMeta, message: &[u8]| {
+            self.look_back.at_position(position);
+            unchecked += field.work(message.len()).max(BYTES_PER_CHECK / SAMPLES_PER_CHECK);
+            let is_due = unchecked >= BYTES_PER_CHECK;
+            unchecked = if is_due { 0 } else { unchecked };
+            let checked = if is_due { self.per_call.due.check() } else { Ok(()) };
+            let number = checked.and_then(|()| {
+                let number = field.path.number(message, meta.sample.endian);
+                number.map_err(|error| self.unreadable(&field.path, error))
             });
-        // No slot of the ring may stay pinned between two calls.
-        leases.clear();
-        if let (Some(curve), Ok(column)) = (&field.curve, &column) {
-            curve.column(column);
+            match number {
+                Ok(number) => {
+                    column.values.push(number);
+                    column.at_ns.push(meta.sample.at_ns);
+                    ControlFlow::Continue(())
+                }
+                Err(error) => {
+                    failed = Some(error);
+                    ControlFlow::Break(())
+                }
+            }
+        };
+        self.held(|| self.reader.visit_while_before(self.until(), most, keep, add))?;
+        if let Some(error) = failed {
+            return Err(error);
         }
-        column
+        // Read newest first.
+        column.values.reverse();
+        column.at_ns.reverse();
+        if let Some(curve) = &field.curve {
+            curve.column(&column);
+        }
+        Ok(column)
     }
 
     /// Records values of fields that are compiled from now on in `curves`.

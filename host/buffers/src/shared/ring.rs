@@ -3,6 +3,7 @@
 //! The ring continues in other memory when another process takes over the topic: the samples in the
 //! earlier memory stay in the ring until newer ones replace them.
 
+use std::ops::ControlFlow;
 use std::sync::{Arc, PoisonError, RwLock};
 
 use super::{HeldSample, META_WORDS, ReadError, SharedReader};
@@ -47,8 +48,13 @@ impl<M> RingPart<M> {
         self.first.checked_add(position.checked_sub(self.base)?)
     }
 
+    /// Position in the ring of a sample of its memory.
+    fn position(&self, held: &HeldSample) -> u64 {
+        self.base + (held.position() - self.first)
+    }
+
     fn lease(&self, held: HeldSample) -> Lease<M> {
-        let position = self.base + (held.position() - self.first);
+        let position = self.position(&held);
         let meta = (self.decode)(held.meta());
         Lease::shared(held, position, meta)
     }
@@ -146,9 +152,9 @@ impl<M> SharedRing<M> {
     }
 
     pub(crate) fn newest_before(&self, end: u64) -> Option<Lease<M>> {
-        let mut newest = None;
-        self.newest_while_into(end, 1, |_| true, |lease| newest = Some(lease));
-        newest
+        let parts = self.parts();
+        let found = self.newest_of_all(&parts, end, 1, |_| true);
+        found.into_iter().find_map(|(part, samples)| Some(part.lease(samples.into_iter().next()?)))
     }
 
     pub(crate) fn newest_while(
@@ -158,42 +164,58 @@ impl<M> SharedRing<M> {
         keep: impl FnMut(&M) -> bool,
         out: &mut Vec<Lease<M>>,
     ) {
-        self.newest_while_into(end, max, keep, |lease| out.push(lease));
+        let parts = self.parts();
+        for (part, samples) in self.newest_of_all(&parts, end, max, keep).into_iter().rev() {
+            out.extend(samples.into_iter().map(|held| part.lease(held)));
+        }
     }
 
-    fn newest_while_into(
+    /// As [`RingReader::visit_while_before`](crate::RingReader::visit_while_before).
+    pub(crate) fn visit_while(
         &self,
         end: u64,
         max: usize,
-        mut keep: impl FnMut(&M) -> bool,
-        mut take: impl FnMut(Lease<M>),
+        keep: impl FnMut(&M) -> bool,
+        mut visit: impl FnMut(u64, &M, &[u8]) -> ControlFlow<()>,
     ) {
         let parts = self.parts();
-        let Some((current, earlier)) = parts.split_first() else { return };
+        for (part, samples) in self.newest_of_all(&parts, end, max, keep) {
+            for held in samples.iter().rev() {
+                let meta = (part.decode)(held.meta());
+                if visit(part.position(held), &meta, held).is_break() {
+                    return;
+                }
+            }
+        }
+    }
+
+    /// Holds the newest samples below `end`, at most `max`, back to the first one that `keep`
+    /// refuses: those of the newest part first, oldest first in each.
+    fn newest_of_all<'a>(
+        &self,
+        parts: &'a [Arc<RingPart<M>>],
+        end: u64,
+        max: usize,
+        mut keep: impl FnMut(&M) -> bool,
+    ) -> Vec<(&'a RingPart<M>, Vec<HeldSample>)> {
+        let mut found = Vec::new();
+        let Some(current) = parts.first() else { return found };
         // The topic may show more than `depth`, also from before the first position.
         let head = current.end();
         let oldest = head.saturating_sub(self.depth);
         let shown = end.min(head).saturating_sub(oldest);
-        let max = u32::try_from(shown.min(max as u64)).unwrap_or(u32::MAX);
-        let (samples, mut is_whole) = self.newest_of(current, end, max, &mut keep);
-        if !is_whole || earlier.is_empty() {
-            return samples.into_iter().map(|held| current.lease(held)).for_each(take);
-        }
-        let mut left = max.saturating_sub(samples.len() as u32);
-        let mut found = vec![(current, samples)];
-        let mut newer = current;
-        for part in earlier {
+        let mut left = u32::try_from(shown.min(max as u64)).unwrap_or(u32::MAX);
+        let mut end = end;
+        for part in parts {
+            let (samples, is_whole) = self.newest_of(part, end, left, &mut keep);
+            left = left.saturating_sub(samples.len() as u32);
+            end = end.min(part.base);
+            found.push((&**part, samples));
             if left == 0 || !is_whole {
                 break;
             }
-            let (samples, all) = self.newest_of(part, end.min(newer.base), left, &mut keep);
-            left = left.saturating_sub(samples.len() as u32);
-            found.push((part, samples));
-            (newer, is_whole) = (part, all);
         }
-        for (part, samples) in found.into_iter().rev() {
-            samples.into_iter().map(|held| part.lease(held)).for_each(&mut take);
-        }
+        found
     }
 
     /// Holds the newest samples of a part below `end`, as far back as `keep` wants. Also returns

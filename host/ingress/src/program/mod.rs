@@ -30,7 +30,7 @@ use crate::Ingress;
 use args::{Args, IngressCommand};
 use topics::TopicsArgs;
 
-/// What real-time priority needs.
+/// Permissions, one of which real-time priority needs.
 const REAL_TIME_HELP: &str = "it needs `ulimit -r 1` or CAP_SYS_NICE; in a service, \
                               `LimitRTPRIO=1` and `RestrictRealtime=no`";
 
