@@ -3,9 +3,11 @@
 //! Each has a checkout of its own below `target/revisions`, with its own build. It is kept, so that
 //! only the first measurement of a revision takes the time of a build.
 
+use std::env;
 use std::ffi::{OsStr, OsString};
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
+use std::process::Command;
 
 use gleaner_base::{Exit, Failure};
 
@@ -119,16 +121,26 @@ impl Revision {
             remove(old)?;
         }
         if LIVE.iter().any(|live| name == *live) {
-            let mut player = self.checkout.cargo();
+            let mut player = self.cargo();
             steps::run(player.args(["xtask", "player"]), "see the message above")?;
         }
         self.run(name, &["--quick".into()], &trial)
     }
 
+    /// Cargo with the Python of the user: that of the checkout may not be made yet.
+    fn cargo(&self) -> Command {
+        let mut cargo = self.checkout.cargo();
+        match env::var_os("GLEANER_PYTHON") {
+            Some(python) => cargo.env("GLEANER_PYTHON", python),
+            None => cargo.env_remove("GLEANER_PYTHON"),
+        };
+        cargo
+    }
+
     /// Runs the benchmark; its results are in `out` afterwards.
     fn run(&self, name: &OsStr, options: &[OsString], out: &Path) -> Result<(), Failure> {
         let results = out.join("results.json");
-        let mut bench = self.checkout.cargo();
+        let mut bench = self.cargo();
         bench.args(["xtask", "bench"]).arg(name).args(options).arg("--out").arg(out);
         let ended = steps::run(&mut bench, "see the messages above");
         // A goal that is not met is no error here.
@@ -207,8 +219,9 @@ mod tests {
     use crate::test_folder::TestFolder;
 
     /// Takes the place of cargo: the results are the content of `value` in the checkout. Each call
-    /// is a line of `calls`, next to this file.
+    /// is a line of `calls`, next to this file. A Python that is named has to exist.
     const CARGO: &str = r#"#!/bin/sh
+test -x "${GLEANER_PYTHON:-/bin/sh}" || exit 1
 echo "$(cat value) $*" >> "$(dirname "$0")/calls"
 test "$(cat value)" != broken || exit 1
 while [ "$1" != --out ]; do shift; done
