@@ -19,11 +19,11 @@ const BENCHMARKS: [(&str, &str); 9] = [
     ("cold-start", "a minute"),
     ("kernels", "a minute"),
     ("replay", "two minutes"),
-    ("record", "four minutes"),
+    ("record", "three minutes"),
     ("drives", "two minutes"),
     ("inference", "5 minutes"),
-    ("scale", "27 minutes"),
-    ("isolation", "32 minutes"),
+    ("scale", "24 minutes"),
+    ("isolation", "28 minutes"),
     ("rtt", "two hours"),
 ];
 
