@@ -4,6 +4,7 @@ use std::fs;
 use std::net::Ipv4Addr;
 use std::process::Command;
 
+use gleaner_base::Exit;
 use gleaner_parts::Parts;
 use nix::ifaddrs::getifaddrs;
 use nix::net::if_::InterfaceFlags;
@@ -88,12 +89,17 @@ fn real_time(parts: &Parts) -> Finding {
         |path| Command::new(path).arg("real-time").output().map_err(|error| error.to_string());
     let answer = parts.program("gleaner-ingress").map_err(|error| error.to_string()).and_then(ask);
     match answer {
-        Ok(output) if output.status.success() => Finding::ok(SUBJECT, "permitted"),
+        Ok(output) if output.status.success() => Finding::ok(SUBJECT, "permitted to this user"),
         // Few need it, so this is no warning.
-        Ok(_) => Finding::ok(
+        Ok(output) if output.status.code() == Some(Exit::Internal.code().into()) => Finding::ok(
             SUBJECT,
-            "not permitted; only `gleaner run --real-time` needs it, see docs/live.md",
+            "not permitted to this user; only `gleaner run --real-time` needs it, see docs/live.md",
         ),
+        Ok(output) => {
+            let why = String::from_utf8_lossy(&output.stderr);
+            let why = why.trim().lines().last().unwrap_or("gleaner-ingress failed").to_owned();
+            Finding::warning(SUBJECT, why, "build it again: cargo build --release")
+        }
         Err(why) => Finding::warning(SUBJECT, why, "build it again: cargo build --release"),
     }
 }

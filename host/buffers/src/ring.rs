@@ -183,7 +183,9 @@ impl<M> RingState<M> {
         let mut show = |position, meta: &M, bytes: &[u8]| {
             if keep(meta) { visit(position, meta, bytes) } else { ControlFlow::Break(()) }
         };
-        if show(position, newest.meta(), &newest).is_break() {
+        let shown = show(position, newest.meta(), &newest);
+        drop(newest);
+        if shown.is_break() {
             return;
         }
         let oldest = (position + 1).saturating_sub(self.depth());

@@ -259,24 +259,22 @@ impl Topic {
         let add = |position, meta: &StoredMeta, message: &[u8]| {
             self.look_back.at_position(position);
             unchecked += field.work(message.len()).max(BYTES_PER_CHECK / SAMPLES_PER_CHECK);
-            let is_due = unchecked >= BYTES_PER_CHECK;
-            unchecked = if is_due { 0 } else { unchecked };
-            let checked = if is_due { self.per_call.due.check() } else { Ok(()) };
-            let number = checked.and_then(|()| {
-                let number = field.path.number(message, meta.sample.endian);
-                number.map_err(|error| self.unreadable(&field.path, error))
-            });
-            match number {
+            if unchecked >= BYTES_PER_CHECK {
+                unchecked = 0;
+                if let Err(late) = self.per_call.due.check() {
+                    failed = Some(late);
+                    return ControlFlow::Break(());
+                }
+            }
+            match field.path.number(message, meta.sample.endian) {
                 Ok(number) => {
                     column.values.push(number);
                     column.at_ns.push(meta.sample.at_ns);
-                    ControlFlow::Continue(())
                 }
-                Err(error) => {
-                    failed = Some(error);
-                    ControlFlow::Break(())
-                }
+                // The error is that of the oldest one.
+                Err(error) => failed = Some(self.unreadable(&field.path, error)),
             }
+            ControlFlow::Continue(())
         };
         self.held(|| self.reader.visit_while_before(self.until(), most, keep, add))?;
         if let Some(error) = failed {

@@ -22,11 +22,8 @@ use crate::input::continue_fed_input;
 use crate::invoker::Invoker;
 use crate::schedule::WakeSchedule;
 
-/// Interval at which the ingress, the recorder and the time of the next report are checked. Each
-/// check wakes a core if nothing else does.
-const ROUND: Duration = Duration::from_millis(200);
-/// The same without an ingress, so that the next one is joined soon.
-const ROUND_OF_GAP: Duration = Duration::from_millis(50);
+/// Interval at which signals, the recorder and the time of the next report are checked.
+const ROUND: Duration = Duration::from_millis(50);
 /// Watchdog interval of the event loop, including stalls.
 const ALIVE: Duration = Duration::from_secs(30);
 
@@ -54,19 +51,20 @@ impl LiveEventLoop {
     /// Runs until `stop` is set.
     pub(super) fn run(&mut self, stop: &AtomicBool) -> Result<(), Failure> {
         let mut last_round = self.clock.now();
-        // A signal ends the wait.
-        while !stop.load(Ordering::Relaxed) {
+        loop {
             // Before the look at the schedule: a later sample ends the wait.
             let seen = self.bell.value();
             let now = self.clock.now();
-            let round = nanoseconds(if self.feed.has_ingress() { ROUND } else { ROUND_OF_GAP });
             self.feed.look_for_losses();
             // A wake does not wait for the round, nor a round for many wakes.
             let wake = self.schedule.next_tick(now).or_else(|| self.schedule.next_event());
             let is_woken = wake.is_some();
             wake.map_or(Ok(()), |wake| self.wake(wake))?;
-            if now.saturating_sub(last_round) >= round {
+            if now.saturating_sub(last_round) >= nanoseconds(ROUND) {
                 last_round = now;
+                if stop.load(Ordering::Relaxed) {
+                    return Ok(());
+                }
                 self.pulse.alive(ALIVE);
                 self.results.flush();
                 self.housekeeping(now)?;
@@ -76,14 +74,16 @@ impl LiveEventLoop {
             if is_woken {
                 continue;
             }
-            let due =
-                self.schedule.next_due().unwrap_or(i64::MAX).min(last_round.saturating_add(round));
+            let due = self
+                .schedule
+                .next_due()
+                .unwrap_or(i64::MAX)
+                .min(last_round.saturating_add(nanoseconds(ROUND)));
             // A lambda that keeps too many samples may have missed one just now.
             self.invoker.free_holds();
             let left = u64::try_from(due.saturating_sub(now)).unwrap_or(0);
             self.bell.wait(seen, Duration::from_nanos(left));
         }
-        Ok(())
     }
 
     fn wake(&mut self, wake: Wake) -> Result<(), Failure> {

@@ -217,11 +217,21 @@ fn a_survived_refusal_of_memory_is_not_the_cause_of_a_later_refusal() {
 /// An input without a guest, with `messages` copies of a message in its ring. The type is given by
 /// name and definition.
 fn topic(
-    (name, text): (&str, &str),
+    definition: (&str, &str),
     depth: usize,
     max_size: &str,
     messages: u64,
     cdr: &[u8],
+) -> Arc<Topic> {
+    topic_of(definition, depth, max_size, (0..messages).map(|_| cdr))
+}
+
+/// As [`topic`], with these messages.
+fn topic_of<'a>(
+    (name, text): (&str, &str),
+    depth: usize,
+    max_size: &str,
+    samples: impl Iterator<Item = &'a [u8]>,
 ) -> Arc<Topic> {
     let manifest = format!(
         "[lambda]\nname = \"many\"\nversion = \"0.1.0\"\nkind = \"wasm\"\nentry = \"many.wasm\"\n\
@@ -230,7 +240,7 @@ fn topic(
     );
     let manifest = Manifest::parse(&manifest, "lambda.toml").unwrap();
     let (mut transport, topic) = subscribed(&manifest, text);
-    (1..=messages).for_each(|seq| publish(&mut transport, "/many", seq, cdr));
+    (1..).zip(samples).for_each(|(seq, cdr)| publish(&mut transport, "/many", seq, cdr));
     topic
 }
 
@@ -259,6 +269,21 @@ fn a_column_has_the_newest_65_536_values() {
         assert_eq!((column.values.len(), column.at_ns.len()), (COLUMN_LEN, COLUMN_LEN));
         assert_eq!((column.at_ns[0], column.at_ns[COLUMN_LEN - 1]), (101, sent as i64));
     }
+}
+
+#[test]
+fn the_error_of_a_column_is_that_of_its_oldest_unreadable_sample() {
+    let samples: [&[u8]; 4] = [&[1, 0, 0, 0], &[1, 0], &[1, 0, 0], &[2, 0, 0, 0]];
+    let topic = topic_of(only("uint32 x\n"), 4, "16 B", samples.into_iter());
+    let field = topic.field("x").unwrap();
+    let errors: Vec<_> = topic.last(4).unwrap().iter().map(|it| it.number(&field).err()).collect();
+    let [None, Some(older), Some(newer), None] = &errors[..] else { panic!("{errors:?}") };
+    assert_ne!(older.to_string(), newer.to_string());
+    for column in [topic.column(&field, 4), topic.column_since(&field, 0)] {
+        assert_eq!(column.unwrap_err().to_string(), older.to_string());
+    }
+    assert_eq!(topic.column(&field, 2).unwrap_err().to_string(), newer.to_string());
+    assert_eq!(topic.column(&field, 1).unwrap().values, [2.0]);
 }
 
 #[test]

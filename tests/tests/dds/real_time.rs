@@ -142,8 +142,8 @@ fn doctor_permits(mut gleaner: Command) -> bool {
     let text = String::from_utf8(output.stdout).unwrap();
     let line = text.lines().find(|line| line.contains("real time:")).expect("a finding");
     let (_, detail) = line.split_once("real time: ").unwrap();
-    let denied = detail.starts_with("not permitted; only `gleaner run --real-time` needs it");
-    assert!(denied || detail == "permitted", "{text}");
+    let denied = detail.starts_with("not permitted to this user; only `gleaner run --real-time`");
+    assert!(denied || detail == "permitted to this user", "{text}");
     !denied
 }
 
