@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use gleaner_tests::live::{PATIENCE, RunningProgram, descendants, run, run_all, run_by};
 use gleaner_tests::vehicle::{TestVehicle, text};
-use gleaner_tests::{TempFolder, program, root};
+use gleaner_tests::{LambdaCopy, TempFolder, program, root};
 use gleaner_vitals::usage::ProcessUsage;
 use libtest_mimic::Failed;
 
@@ -125,7 +125,8 @@ fn of_a_vehicle() -> Result<(), Failed> {
     let mut vehicle = TestVehicle::new();
     fs::write(vehicle.path("vehicle.toml"), "[network]\nreal_time = true\n").unwrap();
     vehicle.start();
-    let deployed = vehicle.deploy(&root().join("tests/lambdas/ticker/rust"), &[]);
+    let lambda = LambdaCopy::named("tests/lambdas/ticker/rust", "ticker");
+    let deployed = vehicle.deploy(lambda.path(), &[]);
     assert!(deployed.status.success(), "{}", text(&deployed));
     vehicle.until_running(&["ticker"]);
     let [ingress] = vehicle.processes("gleaner-ingress")[..] else {
