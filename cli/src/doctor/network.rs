@@ -85,23 +85,29 @@ fn socket_filter(max: Option<u64>) -> Finding {
 /// Lets the ingress ask for the priority: limits, capabilities and control groups decide.
 fn real_time(parts: &Parts) -> Finding {
     const SUBJECT: &str = "real time";
-    let ask =
-        |path| Command::new(path).arg("real-time").output().map_err(|error| error.to_string());
-    let answer = parts.program("gleaner-ingress").map_err(|error| error.to_string()).and_then(ask);
-    match answer {
-        Ok(output) if output.status.success() => Finding::ok(SUBJECT, "permitted to this user"),
+    match is_real_time_permitted(parts) {
+        Ok(true) => Finding::ok(SUBJECT, "permitted to this user"),
         // Few need it, so this is no warning.
-        Ok(output) if output.status.code() == Some(Exit::Internal.code().into()) => Finding::ok(
+        Ok(false) => Finding::ok(
             SUBJECT,
             "not permitted to this user; only `gleaner run --real-time` needs it, see docs/live.md",
         ),
-        Ok(output) => {
-            let why = String::from_utf8_lossy(&output.stderr);
-            let why = why.trim().lines().last().unwrap_or("gleaner-ingress failed").to_owned();
-            Finding::warning(SUBJECT, why, "build it again: cargo build --release")
-        }
         Err(why) => Finding::warning(SUBJECT, why, "build it again: cargo build --release"),
     }
+}
+
+fn is_real_time_permitted(parts: &Parts) -> Result<bool, String> {
+    let ingress = parts.program("gleaner-ingress").map_err(|error| error.to_string())?;
+    let output = Command::new(ingress).arg("real-time").output();
+    let output = output.map_err(|error| error.to_string())?;
+    if output.status.success() {
+        return Ok(true);
+    }
+    if output.status.code() == Some(Exit::Internal.code().into()) {
+        return Ok(false);
+    }
+    let why = String::from_utf8_lossy(&output.stderr);
+    Err(why.trim().lines().last().unwrap_or("gleaner-ingress failed").to_owned())
 }
 
 fn discovery(interfaces: &[Interface], routes: &str, localhost_only: bool) -> Finding {

@@ -266,13 +266,13 @@ impl Topic {
                     return ControlFlow::Break(());
                 }
             }
-            match field.path.number(message, meta.sample.endian) {
+            match self.number(&field.path, message, meta) {
                 Ok(number) => {
                     column.values.push(number);
                     column.at_ns.push(meta.sample.at_ns);
                 }
                 // The error is that of the oldest one.
-                Err(error) => failed = Some(self.unreadable(&field.path, error)),
+                Err(error) => failed = Some(error),
             }
             ControlFlow::Continue(())
         };
@@ -303,9 +303,10 @@ impl Topic {
     pub(super) fn number(
         &self,
         path: &FieldPath,
-        lease: &Lease<StoredMeta>,
+        message: &[u8],
+        meta: &StoredMeta,
     ) -> Result<f64, DataError> {
-        path.number(lease, lease.meta().sample.endian).map_err(|error| self.unreadable(path, error))
+        path.number(message, meta.sample.endian).map_err(|error| self.unreadable(path, error))
     }
 
     pub(super) fn unreadable(&self, path: &FieldPath, error: CdrError) -> DataError {

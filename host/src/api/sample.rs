@@ -81,7 +81,7 @@ impl Sample {
     pub fn number(&self, field: &Field) -> Result<f64, DataError> {
         self.topic.per_call.charge(|| field.work(self.lease.len()))?;
         field.must_belong_to(&self.topic)?;
-        let number = self.topic.number(&field.path, &self.lease)?;
+        let number = self.topic.number(&field.path, &self.lease, self.lease.meta())?;
         field.draw(self.meta().at_ns, number);
         Ok(number)
     }

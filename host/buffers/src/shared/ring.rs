@@ -153,8 +153,18 @@ impl<M> SharedRing<M> {
 
     pub(crate) fn newest_before(&self, end: u64) -> Option<Lease<M>> {
         let parts = self.parts();
-        let found = self.newest_of_all(&parts, end, 1, |_| true);
-        found.into_iter().find_map(|(part, samples)| Some(part.lease(samples.into_iter().next()?)))
+        let mut newest = None;
+        self.newest_of_all(
+            &parts,
+            end,
+            1,
+            |_| true,
+            |part, samples| {
+                newest = samples.into_iter().next().map(|held| part.lease(held));
+                ControlFlow::Continue(())
+            },
+        );
+        newest
     }
 
     pub(crate) fn newest_while(
@@ -165,7 +175,12 @@ impl<M> SharedRing<M> {
         out: &mut Vec<Lease<M>>,
     ) {
         let parts = self.parts();
-        for (part, samples) in self.newest_of_all(&parts, end, max, keep).into_iter().rev() {
+        let mut found = Vec::new();
+        self.newest_of_all(&parts, end, max, keep, |part, samples| {
+            found.push((part, samples));
+            ControlFlow::Continue(())
+        });
+        for (part, samples) in found.into_iter().rev() {
             out.extend(samples.into_iter().map(|held| part.lease(held)));
         }
     }
@@ -179,27 +194,26 @@ impl<M> SharedRing<M> {
         mut visit: impl FnMut(u64, &M, &[u8]) -> ControlFlow<()>,
     ) {
         let parts = self.parts();
-        for (part, samples) in self.newest_of_all(&parts, end, max, keep) {
-            for held in samples.iter().rev() {
+        self.newest_of_all(&parts, end, max, keep, |part, samples| {
+            samples.iter().rev().try_for_each(|held| {
                 let meta = (part.decode)(held.meta());
-                if visit(part.position(held), &meta, held).is_break() {
-                    return;
-                }
-            }
-        }
+                visit(part.position(held), &meta, held)
+            })
+        });
     }
 
     /// Holds the newest samples below `end`, at most `max`, back to the first one that `keep`
-    /// refuses: those of the newest part first, oldest first in each.
+    /// refuses, and passes them to `found` part by part until it breaks: the newest part first, the
+    /// oldest sample first in each.
     fn newest_of_all<'a>(
         &self,
         parts: &'a [Arc<RingPart<M>>],
         end: u64,
         max: usize,
         mut keep: impl FnMut(&M) -> bool,
-    ) -> Vec<(&'a RingPart<M>, Vec<HeldSample>)> {
-        let mut found = Vec::new();
-        let Some(current) = parts.first() else { return found };
+        mut found: impl FnMut(&'a RingPart<M>, Vec<HeldSample>) -> ControlFlow<()>,
+    ) {
+        let Some(current) = parts.first() else { return };
         // The topic may show more than `depth`, also from before the first position.
         let head = current.end();
         let oldest = head.saturating_sub(self.depth);
@@ -210,12 +224,10 @@ impl<M> SharedRing<M> {
             let (samples, is_whole) = self.newest_of(part, end, left, &mut keep);
             left = left.saturating_sub(samples.len() as u32);
             end = end.min(part.base);
-            found.push((&**part, samples));
-            if left == 0 || !is_whole {
-                break;
+            if found(part, samples).is_break() || left == 0 || !is_whole {
+                return;
             }
         }
-        found
     }
 
     /// Holds the newest samples of a part below `end`, as far back as `keep` wants. Also returns
