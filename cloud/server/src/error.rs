@@ -8,6 +8,8 @@ use axum::response::{IntoResponse, Response};
 use gleaner_base::{Exit, Failure};
 use gleaner_protocol::vehicle_api::Problem;
 
+use crate::sqlx;
+
 /// The type of the content of an error.
 const PROBLEM: &str = "application/problem+json";
 

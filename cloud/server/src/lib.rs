@@ -38,6 +38,7 @@ mod replicas;
 mod request;
 mod s3;
 mod server;
+mod sqlx;
 mod store;
 mod tails;
 mod transfer;

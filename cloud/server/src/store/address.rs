@@ -5,10 +5,10 @@ use std::str::FromStr;
 use std::time::Duration;
 
 use gleaner_base::{Exit, Failure};
-use sqlx::any::{AnyConnectOptions, AnyPoolOptions};
-use sqlx::{AnyConnection, AnyPool, Connection};
 
 use crate::error::database_failure;
+use crate::sqlx::any::{AnyConnectOptions, AnyPoolOptions};
+use crate::sqlx::{self, AnyConnection, AnyPool, Connection};
 
 /// Settings of each connection to SQLite. In the mode WAL, readers and the writer do not wait for
 /// each other; FULL makes each commit durable before it returns. Pages that change often are copied
@@ -84,7 +84,7 @@ impl StoreAddress {
     ///
     /// A failure that names the cause.
     pub(super) async fn connect(&self, connections: u32) -> Result<AnyPool, Failure> {
-        sqlx::any::install_default_drivers();
+        sqlx::install_own_drivers();
         let is_sqlite = matches!(self, Self::Sqlite(_));
         let (Self::Sqlite(url) | Self::Postgres(url)) = self;
         let failed = |error: sqlx::Error| {

@@ -3,12 +3,12 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use gleaner_fleet::{Ack, Cursor};
-use sqlx::AssertSqlSafe;
 
 use super::records::{Retention, StreamBatch};
 use super::writer::{GroupVehicles, VehicleWrite, Waiting, WaitingWrite, counting};
 use super::{CloudStore, StoreChange, in_list, int, list_parts, parts, unsigned};
 use crate::error::{CloudError, CloudResult};
+use crate::sqlx::{self, AssertSqlSafe};
 
 /// Maximum number of streams of a vehicle: two, and one for each lambda that it ever had.
 const STREAMS_MAX: i64 = 1000;

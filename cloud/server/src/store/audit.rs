@@ -73,14 +73,16 @@ impl CloudStore {
 
     #[cfg(test)]
     pub(crate) async fn execute(&self, sql: &'static str) {
-        sqlx::raw_sql(sql).execute(&self.pool).await.unwrap();
+        crate::sqlx::raw_sql(sql).execute(&self.pool).await.unwrap();
     }
 
     #[cfg(test)]
     pub(crate) async fn execute_with(&self, sql: &'static str, values: &[&str]) {
-        let bind =
-            |query: sqlx::query::Query<'static, _, _>, value: &&str| query.bind(value.to_string());
-        values.iter().fold(sqlx::query(sql), bind).execute(&self.pool).await.unwrap();
+        let mut query = crate::sqlx::query(sql);
+        for value in values {
+            query = query.bind((*value).to_owned());
+        }
+        query.execute(&self.pool).await.unwrap();
     }
 }
 

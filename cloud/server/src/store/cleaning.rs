@@ -12,6 +12,7 @@ use gleaner_trust::unverified_revision;
 use super::clips::clip_id;
 use super::{CloudStore, StoreChange, int, now, unsigned};
 use crate::error::{CloudError, CloudResult};
+use crate::sqlx;
 
 /// Actor of changes that the cloud makes by its rules.
 const RULES: &str = "rules";

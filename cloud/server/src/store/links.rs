@@ -6,13 +6,13 @@ use gleaner_base::excerpt;
 use gleaner_fleet::{Cursor, Hello};
 use gleaner_protocol::supervision::LambdaPhase;
 use gleaner_protocol::vehicle_api::{DeploymentStatus, VehicleStatus};
-use sqlx::AssertSqlSafe;
 
 use super::vehicles::{FAILED, RUNNING, ended, json};
 use super::wants::WishedVehicle;
 use super::writer::{GroupVehicles, VehicleWrite, Waiting, WaitingWrite, counting};
 use super::{CloudStore, StoreChange, in_list, int, list_parts, now, parts, unsigned};
 use crate::error::CloudResult;
+use crate::sqlx::{self, AssertSqlSafe};
 
 /// Maximum number of deployments in a report that count.
 const DEPLOYMENTS_MAX: usize = 1000;

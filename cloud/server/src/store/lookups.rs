@@ -4,12 +4,12 @@
 
 use std::collections::{BTreeSet, HashMap};
 
-use sqlx::{AnyPool, AssertSqlSafe};
 use tokio::sync::{mpsc, oneshot};
 
 use super::writer::stopped;
 use super::{in_list, list_parts};
 use crate::error::CloudResult;
+use crate::sqlx::{self, AnyPool, AssertSqlSafe};
 
 /// Maximum number of lookups in a query.
 const GROUP_MAX: usize = 256;

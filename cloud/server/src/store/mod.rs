@@ -7,28 +7,28 @@
 /// Runs a statement with these values; returns its result.
 macro_rules! run {
     ($on:expr; $sql:expr $(; $($value:expr),+)?) => {
-        sqlx::query($sql)$($(.bind($value))+)?.execute($on).await?
+        crate::sqlx::query($sql)$($(.bind($value))+)?.execute($on).await?
     };
 }
 
 /// Runs a query with these values; returns its row, if there is one.
 macro_rules! row {
     ($on:expr; $sql:expr $(; $($value:expr),+)?) => {
-        sqlx::query_as($sql)$($(.bind($value))+)?.fetch_optional($on).await?
+        crate::sqlx::query_as($sql)$($(.bind($value))+)?.fetch_optional($on).await?
     };
 }
 
 /// Runs a query with these values; returns its only row.
 macro_rules! one {
     ($on:expr; $sql:expr $(; $($value:expr),+)?) => {
-        sqlx::query_as($sql)$($(.bind($value))+)?.fetch_one($on).await?
+        crate::sqlx::query_as($sql)$($(.bind($value))+)?.fetch_one($on).await?
     };
 }
 
 /// Runs a query with these values; returns its rows.
 macro_rules! rows {
     ($on:expr; $sql:expr $(; $($value:expr),+)?) => {
-        sqlx::query_as($sql)$($(.bind($value))+)?.fetch_all($on).await?
+        crate::sqlx::query_as($sql)$($(.bind($value))+)?.fetch_all($on).await?
     };
 }
 
@@ -63,13 +63,13 @@ use std::sync::Arc;
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use gleaner_base::{Exit, Failure};
-use sqlx::{Any, AnyPool, AssertSqlSafe, Transaction};
 use tokio::sync::{Mutex, MutexGuard};
 
 use self::lookups::LookupQueue;
 use self::wants::WantedStates;
 use self::writer::WriteQueue;
 use crate::error::{CloudError, CloudResult};
+use crate::sqlx::{self, Any, AnyPool, AssertSqlSafe, Transaction};
 
 pub(crate) use address::StoreAddress;
 pub(crate) use chunks::{ChunkSizes, KeptLine, StoredChunk};

@@ -4,11 +4,10 @@
 //! A process whose lease has ended is not online, and neither are its vehicles. The clocks of the
 //! replicas' machines have to agree within seconds.
 
-use sqlx::AssertSqlSafe;
-
 use super::writer::{GroupVehicles, VehicleWrite, Waiting, WaitingWrite, counting};
 use super::{CloudStore, StoreChange, in_list, int, now, parts, unsigned};
 use crate::error::{CloudError, CloudResult};
+use crate::sqlx::{self, AssertSqlSafe};
 
 /// Lifetime of a lease, in s: several times the interval at which it is renewed.
 const LEASE_S: i64 = 15;

@@ -115,7 +115,7 @@ impl StoreChange<'_> {
 impl super::CloudStore {
     /// Returns the answers that are kept.
     pub(crate) async fn kept_answers(&self) -> Vec<String> {
-        let rows: Result<Vec<(String,)>, sqlx::Error> =
+        let rows: Result<Vec<(String,)>, crate::sqlx::Error> =
             async { Ok(rows!(&self.pool; "SELECT answer FROM request_keys")) }.await;
         rows.unwrap().into_iter().map(|(answer,)| answer).collect()
     }

@@ -5,11 +5,11 @@ use std::collections::BTreeMap;
 use gleaner_base::excerpt;
 use gleaner_fleet::people::{VehicleState, VehicleSummary};
 use gleaner_trust::VehicleName;
-use sqlx::AssertSqlSafe;
 
 use super::secrets::SecretKind;
 use super::{ChangeAuthor, CloudStore, StoreChange, in_list, int, now, parts, unsigned};
 use crate::error::{CloudError, CloudResult};
+use crate::sqlx::{self, AssertSqlSafe};
 
 /// A certificate that was made for a vehicle.
 #[derive(Debug)]

@@ -6,12 +6,11 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use gleaner_fleet::{Wanted, desired_digest};
 
-use sqlx::AssertSqlSafe;
-
 use super::deployments::COMPLETE;
 use super::vehicles::ended;
 use super::{CloudStore, StoreChange, in_list, parts, unsigned};
 use crate::error::CloudResult;
+use crate::sqlx::{self, AssertSqlSafe};
 
 /// Maximum number of deployments of all states that are kept, some 200 bytes each.
 const CACHED_MAX: usize = 32_000;

@@ -4,14 +4,14 @@
 
 use gleaner_fleet::waves::{OnFailure, WavePlan, WaveProgress, WaveState};
 use sha2::{Digest, Sha256};
-use sqlx::any::AnyRow;
-use sqlx::{FromRow, Row};
 
 use super::deployments::{COMPLETE, unknown};
 use super::vehicles::{FAILED, RUNNING};
 use super::wants::{ChangedVehicles, TextMap, map, selects};
 use super::{ChangeAuthor, CloudStore, StoreChange, int, now, unsigned};
 use crate::error::{CloudError, CloudResult};
+use crate::sqlx::any::AnyRow;
+use crate::sqlx::{self, FromRow, Row};
 
 /// Actor of steps that the cloud takes by a plan.
 const WAVES: &str = "waves";

@@ -4,7 +4,6 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
-use sqlx::{AnyPool, AssertSqlSafe};
 use tokio::sync::{Mutex, mpsc, oneshot};
 
 use super::append::AppendWrite;
@@ -12,6 +11,7 @@ use super::links::{ConnectWrite, ReportWrite};
 use super::replicas::DisconnectWrite;
 use super::{CloudStore, StoreChange, begin, in_list, list_parts};
 use crate::error::{CloudError, CloudResult};
+use crate::sqlx::{self, AnyPool, AssertSqlSafe};
 
 /// Maximum number of writes in a transaction, so that other changes have their turn. With 1,024,
 /// 10,000 vehicles stored no more in a second.

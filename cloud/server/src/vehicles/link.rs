@@ -5,15 +5,19 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use axum::body::Bytes;
-use axum::extract::ws::{Message, WebSocket};
+use futures_util::{SinkExt, StreamExt};
 use gleaner_base::{Exit, Failure, RateLimit, visible};
 use gleaner_fleet::{
     Ack, Body, Desired, Frame, GoAway, Hello, PROTOCOL, Ping, Pong, Records, Reported, TAIL_S,
     TAIL_STREAMS_MAX, Tail, Welcome, decompress,
 };
 use gleaner_protocol::vehicle_api::VehicleStatus;
+use hyper::upgrade::Upgraded;
+use hyper_util::rt::TokioIo;
 use tokio::sync::{SemaphorePermit, watch};
 use tokio::time::{MissedTickBehavior, interval, sleep, timeout};
+use tokio_tungstenite::WebSocketStream;
+use tokio_tungstenite::tungstenite::Message;
 use zstd::bulk::Decompressor;
 
 use super::batch;
@@ -45,13 +49,15 @@ const PROBLEM_MAX: usize = 1000;
 /// Number of labels of a vehicle, and of the bytes of a name or value.
 const LABEL_MAX: usize = 256;
 
+type Socket = WebSocketStream<TokioIo<Upgraded>>;
+
 /// The connection of a vehicle.
 struct VehicleLink<'c> {
     cloud: &'c Cloud,
     name: &'c str,
     /// SHA-256 of its certificate.
     certificate: &'c str,
-    socket: WebSocket,
+    socket: Socket,
     epoch: u64,
     /// Number of the wanted state that was sent last.
     sent: u64,
@@ -67,7 +73,7 @@ struct StoredReport {
 }
 
 /// Serves a connection until its end.
-pub(super) async fn serve(cloud: &Cloud, (name, certificate): (&str, &str), socket: WebSocket) {
+pub(super) async fn serve(cloud: &Cloud, (name, certificate): (&str, &str), socket: Socket) {
     let mut link = VehicleLink {
         cloud,
         name,
@@ -260,9 +266,9 @@ impl<'c> VehicleLink<'c> {
     /// version, and skipped.
     async fn receive(&mut self) -> CloudResult<Option<Body>> {
         loop {
-            let bytes = match self.socket.recv().await {
+            let bytes = match self.socket.next().await {
                 Some(Ok(Message::Binary(bytes))) => bytes,
-                Some(Ok(Message::Ping(_) | Message::Pong(_))) => continue,
+                Some(Ok(Message::Ping(_) | Message::Pong(_) | Message::Frame(_))) => continue,
                 Some(Ok(Message::Text(_))) => return Err(wrong("a frame of text came")),
                 Some(Ok(Message::Close(_))) | None => return Ok(None),
                 Some(Err(error)) => {

@@ -15,8 +15,7 @@ mod link;
 
 use std::sync::Arc;
 
-use axum::body::Bytes;
-use axum::extract::ws::WebSocketUpgrade;
+use axum::body::{Body, Bytes};
 use axum::extract::{DefaultBodyLimit, Extension, Path, Request, State};
 use axum::http::{HeaderMap, header};
 use axum::middleware::{Next, from_fn, from_fn_with_state};
@@ -24,6 +23,10 @@ use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
 use axum::{Json, Router};
 use gleaner_fleet::{EnrolReply, EnrolRequest, FRAME_MAX, RenewRequest};
+use hyper_util::rt::TokioIo;
+use tokio_tungstenite::WebSocketStream;
+use tokio_tungstenite::tungstenite::handshake::server::create_response_with_body;
+use tokio_tungstenite::tungstenite::protocol::{Role, WebSocketConfig};
 
 use crate::accept::PeerConnection;
 use crate::clients::ClientNetwork;
@@ -125,22 +128,35 @@ fn reply(Issued { certificate, renew, expires, .. }: Issued) -> EnrolReply {
     EnrolReply { certificate, renew, expires }
 }
 
+/// Opens the control channel. Not by axum's own WebSockets: they come with an older tungstenite,
+/// which needs a second `rand` and a third `getrandom`.
 async fn link(
     State(cloud): State<Arc<Cloud>>,
     Extension(vehicle): Extension<KnownVehicle>,
     Extension(peer): Extension<Arc<PeerConnection>>,
-    upgrade: WebSocketUpgrade,
+    mut request: Request,
 ) -> CloudResult<Response> {
+    let response = create_response_with_body(&request, Body::empty).map_err(|error| {
+        let help = "use a version of gleaner that fits the one of the cloud";
+        CloudError::usage("the request opens no WebSocket", help).because(error.to_string())
+    })?;
     cloud.limits.link(&vehicle.name)?;
-    Ok(upgrade
-        .read_buffer_size(READ_BUFFER)
-        .write_buffer_size(0)
-        .max_message_size(FRAME_MAX)
-        .max_frame_size(FRAME_MAX)
-        .on_upgrade(async move |socket| {
+    let upgrade = hyper::upgrade::on(&mut request);
+    tokio::spawn(async move {
+        // Otherwise, the connection has ended before it was one.
+        if let Ok(upgraded) = upgrade.await {
+            let config = WebSocketConfig::default()
+                .read_buffer_size(READ_BUFFER)
+                .write_buffer_size(0)
+                .max_message_size(Some(FRAME_MAX))
+                .max_frame_size(Some(FRAME_MAX));
+            let (stream, role) = (TokioIo::new(upgraded), Role::Server);
+            let socket = WebSocketStream::from_raw_socket(stream, role, Some(config)).await;
             link::serve(&cloud, (&vehicle.name, &vehicle.certificate), socket).await;
-            drop(peer);
-        }))
+        }
+        drop(peer);
+    });
+    Ok(response)
 }
 
 /// Sends a deployment that the vehicle should have. Only from one it learns the digests of

@@ -7,7 +7,10 @@ use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
-use sqlx::Connection;
+use sqlx_core::connection::Connection;
+use sqlx_core::raw_sql::raw_sql;
+use sqlx_core::sql_str::AssertSqlSafe;
+use sqlx_postgres::PgConnection;
 use tempfile::TempDir;
 
 /// Variable with the URL of the server, for tests that run on it.
@@ -28,10 +31,9 @@ pub async fn store_of(folder: &Path) -> Option<String> {
     let server = std::env::var(STORE).ok()?;
     let name = folder.file_name().unwrap().to_str().unwrap();
     let schema = format!("t{}", gleaner_base::hex(name.as_bytes()));
-    sqlx::any::install_default_drivers();
-    let mut connection = sqlx::AnyConnection::connect(&server).await.unwrap();
-    let sql = sqlx::AssertSqlSafe(format!("CREATE SCHEMA IF NOT EXISTS {schema}"));
-    sqlx::raw_sql(sql).execute(&mut connection).await.unwrap();
+    let mut connection = PgConnection::connect(&server).await.unwrap();
+    let sql = AssertSqlSafe(format!("CREATE SCHEMA IF NOT EXISTS {schema}"));
+    raw_sql(sql).execute(&mut connection).await.unwrap();
     connection.close().await.unwrap();
     Some(format!("{server}?options=-csearch_path%3D{schema}"))
 }

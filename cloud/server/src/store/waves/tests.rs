@@ -305,7 +305,7 @@ async fn a_vehicle_whose_labels_change_leaves_the_waves() {
 async fn a_database_of_the_first_version_keeps_its_deployments() {
     let folder = TempDir::new().unwrap();
     let path = folder.path().join("cloud.db");
-    sqlx::any::install_default_drivers();
+    sqlx::install_own_drivers();
     let url = format!("sqlite://{}?mode=rwc", path.display());
     let pool = sqlx::AnyPool::connect(&url).await.unwrap();
     let first = include_str!("../../../migrations/0001_start.sql");

@@ -1,0 +1,79 @@
+//! `Cargo.lock` stays small: it has few packages, and few of them in more than one version.
+
+use std::collections::BTreeMap;
+
+use gleaner_tests::tree::files;
+
+/// Number of packages, ours among them. It only goes down: whoever removes one lowers it.
+const PACKAGES_MAX: usize = 639;
+/// Number of versions beyond the first of each package. It only goes down, too.
+const SURPLUS_MAX: usize = 25;
+
+/// Packages with more than one version, and how many, each with what needs the older ones.
+const REPEATED: &[(&str, usize)] = &[
+    ("bit-vec", 2),        // yasna, of rcgen
+    ("block-buffer", 2),   // digest 0.10
+    ("cpufeatures", 2),    // sha2 0.10
+    ("crypto-common", 2),  // digest 0.10
+    ("digest", 2),         // sha2 0.10
+    ("embedded-io", 2),    // postcard, of wasmtime, which names both and uses none
+    ("getrandom", 2),      // ring
+    ("hashbrown", 2),      // sqlx-core, and gimli of wasmtime
+    ("io-extras", 2),      // socketpair, of rustdds
+    ("io-lifetimes", 2),   // socketpair, of rustdds, and fs-set-times of wasmtime-wasi
+    ("itertools", 3),      // bindgen of cyclors, and ratatui with wasmtime; ros2-client has 0.15
+    ("libloading", 2),     // clang-sys, of cyclors
+    ("linux-raw-sys", 2),  // rustix 0.38
+    ("nom", 2),            // x509-parser of rcgen, and cexpr of cyclors
+    ("rustc-hash", 2),     // bindgen, of cyclors
+    ("rustix", 2),         // which, of cyclors
+    ("sha2", 2),           // cranelift-codegen and wasmtime-environ
+    ("shlex", 2),          // bindgen, of cyclors
+    ("syn", 3),            // cdr-encoding-size-derive of rustdds; 2 has many users, and so has 3
+    ("thiserror", 2),      // cdr-encoding, of rustdds
+    ("thiserror-impl", 2), // thiserror 1
+    ("windows-sys", 3),    // ring, and socketpair of rustdds
+];
+
+/// How to bring two users of a package to one version.
+const HELP: &str = "`cargo tree --target all -e all -i NAME@VERSION` shows what needs a version. \
+                    Another version of that one may do with the version that is there: \
+                    `cargo update -p ONE --precise ITS_VERSION`, or `Cargo.toml`.";
+
+/// Versions of each package.
+fn versions() -> BTreeMap<String, Vec<String>> {
+    let file = files().into_iter().find(|file| file.path == "Cargo.lock").expect("it is there");
+    let lock: toml::Table = file.text.parse().expect("it is TOML");
+    let mut versions = BTreeMap::<_, Vec<_>>::new();
+    for package in lock["package"].as_array().expect("it lists packages") {
+        let text = |key: &str| package[key].as_str().expect("each has one").to_owned();
+        versions.entry(text("name")).or_default().push(text("version"));
+    }
+    versions
+}
+
+#[test]
+fn there_are_no_more_packages_than_there_were() {
+    let packages = versions().values().map(Vec::len).sum::<usize>();
+    let help = "do without the new one, or take off a feature of one that brings others with it";
+    assert!(packages <= PACKAGES_MAX, "{packages} packages, not {PACKAGES_MAX}: {help}");
+}
+
+#[test]
+fn packages_have_one_version_except_those_listed() {
+    let versions = versions();
+    let listed: BTreeMap<_, _> = REPEATED.iter().copied().collect();
+    let mut problems = Vec::new();
+    for (name, found) in versions.iter().filter(|(_, found)| found.len() > 1) {
+        let may = listed.get(name.as_str()).copied().unwrap_or(1);
+        if found.len() > may {
+            problems.push(format!("{name} has the versions {}, not {may}", found.join(", ")));
+        }
+    }
+    assert!(problems.is_empty(), "\n{}\n{HELP}", problems.join("\n"));
+    let count = |name: &str| versions.get(name).map_or(0, Vec::len);
+    let gone: Vec<_> = REPEATED.iter().filter(|(name, may)| count(name) < *may).collect();
+    assert!(gone.is_empty(), "has fewer versions: lower it, or remove it from REPEATED: {gone:?}");
+    let surplus = REPEATED.iter().map(|(_, may)| may - 1).sum::<usize>();
+    assert_eq!(surplus, SURPLUS_MAX, "the sum of REPEATED; it only goes down");
+}
