@@ -1,5 +1,5 @@
-//! What the database needs of sqlx, by the names of its facade. That one would lock its macros and
-//! its driver for MySQL with it, which nothing here uses.
+//! Items of sqlx, under the names of its facade. The facade itself is not a dependency: it would
+//! add its macros and its driver for MySQL to `Cargo.lock`.
 
 use std::sync::Once;
 
@@ -15,11 +15,11 @@ pub(crate) use sqlx_core::row::Row;
 pub(crate) use sqlx_core::sql_str::AssertSqlSafe;
 pub(crate) use sqlx_core::transaction::Transaction;
 
-/// Installs the drivers of both databases, unless they are.
+/// Installs the drivers of SQLite and PostgreSQL at the first call.
 pub(crate) fn install_own_drivers() {
     static ONCE: Once = Once::new();
     ONCE.call_once(|| {
-        // It fails only if others were installed, which nothing here does.
+        // It fails only if other drivers were installed before, and this is the only caller.
         let _ = install_drivers(&[sqlx_postgres::any::DRIVER, sqlx_sqlite::any::DRIVER]);
     });
 }

@@ -1,22 +1,24 @@
-//! `Cargo.lock` stays small: it has few packages, and few of them in more than one version.
+//! Size of `Cargo.lock`: the number of packages, and of packages with several versions.
 
 use std::collections::BTreeMap;
 
 use gleaner_tests::tree::files;
 
-/// Number of packages, ours among them. It only goes down: whoever removes one lowers it.
+/// Number of packages, with those of the workspace. It only goes down: a change that removes a
+/// package lowers it.
 const PACKAGES_MAX: usize = 639;
-/// Number of versions beyond the first of each package. It only goes down, too.
+/// Number of versions beyond the first of each package. It only goes down.
 const SURPLUS_MAX: usize = 25;
 
-/// Packages with more than one version, and how many, each with what needs the older ones.
+/// Packages with several versions: name, number of versions, and in the comment the package that
+/// needs an older one.
 const REPEATED: &[(&str, usize)] = &[
     ("bit-vec", 2),        // yasna, of rcgen
     ("block-buffer", 2),   // digest 0.10
     ("cpufeatures", 2),    // sha2 0.10
     ("crypto-common", 2),  // digest 0.10
     ("digest", 2),         // sha2 0.10
-    ("embedded-io", 2),    // postcard, of wasmtime, which names both and uses none
+    ("embedded-io", 2),    // postcard, of wasmtime, which lists both and uses neither
     ("getrandom", 2),      // ring
     ("hashbrown", 2),      // sqlx-core, and gimli of wasmtime
     ("io-extras", 2),      // socketpair, of rustdds
@@ -35,10 +37,10 @@ const REPEATED: &[(&str, usize)] = &[
     ("windows-sys", 3),    // ring, and socketpair of rustdds
 ];
 
-/// How to bring two users of a package to one version.
-const HELP: &str = "`cargo tree --target all -e all -i NAME@VERSION` shows what needs a version. \
-                    Another version of that one may do with the version that is there: \
-                    `cargo update -p ONE --precise ITS_VERSION`, or `Cargo.toml`.";
+/// Advice for a package that has a further version.
+const HELP: &str = "`cargo tree --target all -e all -i NAME@VERSION` prints the package that needs \
+                    a version. Choose a version of that package which uses the version of the \
+                    others: `cargo update -p PACKAGE --precise VERSION`, or `Cargo.toml`.";
 
 /// Versions of each package.
 fn versions() -> BTreeMap<String, Vec<String>> {
@@ -55,7 +57,7 @@ fn versions() -> BTreeMap<String, Vec<String>> {
 #[test]
 fn there_are_no_more_packages_than_there_were() {
     let packages = versions().values().map(Vec::len).sum::<usize>();
-    let help = "do without the new one, or take off a feature of one that brings others with it";
+    let help = "remove a dependency, or a feature that needs further packages";
     assert!(packages <= PACKAGES_MAX, "{packages} packages, not {PACKAGES_MAX}: {help}");
 }
 

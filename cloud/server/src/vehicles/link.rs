@@ -49,7 +49,7 @@ const PROBLEM_MAX: usize = 1000;
 /// Number of labels of a vehicle, and of the bytes of a name or value.
 const LABEL_MAX: usize = 256;
 
-type Socket = WebSocketStream<TokioIo<Upgraded>>;
+type VehicleSocket = WebSocketStream<TokioIo<Upgraded>>;
 
 /// The connection of a vehicle.
 struct VehicleLink<'c> {
@@ -57,7 +57,7 @@ struct VehicleLink<'c> {
     name: &'c str,
     /// SHA-256 of its certificate.
     certificate: &'c str,
-    socket: Socket,
+    socket: VehicleSocket,
     epoch: u64,
     /// Number of the wanted state that was sent last.
     sent: u64,
@@ -73,7 +73,7 @@ struct StoredReport {
 }
 
 /// Serves a connection until its end.
-pub(super) async fn serve(cloud: &Cloud, (name, certificate): (&str, &str), socket: Socket) {
+pub(super) async fn serve(cloud: &Cloud, (name, certificate): (&str, &str), socket: VehicleSocket) {
     let mut link = VehicleLink {
         cloud,
         name,

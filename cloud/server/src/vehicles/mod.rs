@@ -128,8 +128,8 @@ fn reply(Issued { certificate, renew, expires, .. }: Issued) -> EnrolReply {
     EnrolReply { certificate, renew, expires }
 }
 
-/// Opens the control channel. Not by axum's own WebSockets: they come with an older tungstenite,
-/// which needs a second `rand` and a third `getrandom`.
+/// Opens the control channel. The WebSockets of axum are not used: they need an older tungstenite,
+/// with a second `rand` and a third `getrandom`.
 async fn link(
     State(cloud): State<Arc<Cloud>>,
     Extension(vehicle): Extension<KnownVehicle>,
@@ -143,7 +143,7 @@ async fn link(
     cloud.limits.link(&vehicle.name)?;
     let upgrade = hyper::upgrade::on(&mut request);
     tokio::spawn(async move {
-        // Otherwise, the connection has ended before it was one.
+        // An upgrade fails if the vehicle closed the connection before it.
         if let Ok(upgraded) = upgrade.await {
             let config = WebSocketConfig::default()
                 .read_buffer_size(READ_BUFFER)
