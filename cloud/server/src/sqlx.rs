@@ -1,8 +1,6 @@
 //! Items of sqlx, under the names of its facade. The facade itself is not a dependency: it would
 //! add its macros and its driver for MySQL to `Cargo.lock`.
 
-use std::sync::Once;
-
 use sqlx_core::any::driver::install_drivers;
 pub(crate) use sqlx_core::any::{self, Any, AnyConnection, AnyPool};
 pub(crate) use sqlx_core::connection::Connection;
@@ -15,11 +13,8 @@ pub(crate) use sqlx_core::row::Row;
 pub(crate) use sqlx_core::sql_str::AssertSqlSafe;
 pub(crate) use sqlx_core::transaction::Transaction;
 
-/// Installs the drivers of SQLite and PostgreSQL at the first call.
+/// Installs the drivers of SQLite and PostgreSQL.
 pub(crate) fn install_own_drivers() {
-    static ONCE: Once = Once::new();
-    ONCE.call_once(|| {
-        // It fails only if other drivers were installed before, and this is the only caller.
-        let _ = install_drivers(&[sqlx_postgres::any::DRIVER, sqlx_sqlite::any::DRIVER]);
-    });
+    // An error means that drivers are installed: by an earlier call, as nothing else installs any.
+    let _ = install_drivers(&[sqlx_postgres::any::DRIVER, sqlx_sqlite::any::DRIVER]);
 }

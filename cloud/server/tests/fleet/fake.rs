@@ -207,6 +207,15 @@ impl FakeVehicle {
         whole(soon(send(tls(&self.address, &self.config).await, request)).await.unwrap()).await
     }
 
+    /// Requests the control channel with these headers; returns the answer.
+    pub(crate) async fn handshake(&self, headers: &[(&str, &str)]) -> Response<Incoming> {
+        let request = Request::get("/v1/link").header("host", "cloud");
+        let request =
+            headers.iter().fold(request, |request, (name, value)| request.header(*name, *value));
+        let request = request.body(Full::default()).unwrap();
+        soon(send(self.stream().await, request)).await.unwrap()
+    }
+
     /// Sends a request with a body; returns the answer.
     pub(crate) async fn request(
         &self,

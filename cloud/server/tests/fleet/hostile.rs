@@ -48,6 +48,37 @@ async fn a_hostile_frame_ends_its_own_connection_only() {
 }
 
 #[tokio::test]
+async fn only_a_handshake_of_the_standard_opens_the_control_channel() {
+    let folder = TempDir::new().unwrap();
+    let (server, admin) = start(&folder).await;
+    let (vehicle, _) = admin.enrol("car-7").await;
+    // Key and answer are the example of RFC 6455, section 1.3.
+    let headers = [
+        ("connection", "Upgrade"),
+        ("upgrade", "websocket"),
+        ("sec-websocket-version", "13"),
+        ("sec-websocket-key", "dGhlIHNhbXBsZSBub25jZQ=="),
+    ];
+    let answer = vehicle.handshake(&headers).await;
+    assert_eq!(answer.status(), StatusCode::SWITCHING_PROTOCOLS);
+    assert_eq!(answer.headers()["sec-websocket-accept"], "s3pPLMBiTxaQ9kYGzzhZRbK+xOo=");
+    drop(answer);
+    let wrong = ["close", "h2c", "8", "dGhlIHNhbXBsZQ=="];
+    for (at, value) in wrong.into_iter().enumerate() {
+        let mut headers = headers.to_vec();
+        headers[at].1 = value;
+        let refused = vehicle.handshake(&headers).await.status();
+        assert_eq!(refused, StatusCode::BAD_REQUEST, "{:?}", headers[at]);
+        headers.remove(at);
+        let refused = vehicle.handshake(&headers).await.status();
+        assert_eq!(refused, StatusCode::BAD_REQUEST, "without {}", value);
+    }
+    // The channel still opens.
+    vehicle.connect().await.0.settle().await;
+    server.stop().await;
+}
+
+#[tokio::test]
 async fn requests_without_a_right_are_refused() {
     let folder = TempDir::new().unwrap();
     let (server, admin) = start(&folder).await;
