@@ -42,8 +42,10 @@
 //! the WIT package `gleaner:lambda`. An error in their docs, such as `no-room`, is a case of a WIT
 //! variant; [`Error::kind`] returns its name.
 
+// Generated, and compared with what is generated.
 #[cfg(target_family = "wasm")]
 #[doc(hidden)]
+#[rustfmt::skip]
 pub mod bindings;
 mod config;
 pub mod data;

@@ -8,14 +8,16 @@ use gleaner_base::{Exit, Failure};
 use gleaner_lambda::manifest::GENERATED;
 use gleaner_report::format::trigger_lines;
 
+use crate::bindings;
 use crate::checkout::Checkout;
 use crate::examples::{DRIVE, EXAMPLES, Recipe, TwinReplay, difference};
 use crate::setup;
-use crate::steps::Steps;
+use crate::steps::{self, Steps};
 
-/// Writes the files that are generated from the manifest's types, then `examples/*/expected.txt`
-/// with a line per trigger of the Rust twin, and `examples/cookbook/*/expected.txt`, whose first
-/// line is the command. Fails if the twins of an example differ.
+/// Writes the files that are generated from the manifest's types, and the bindings of the Rust SDK,
+/// then `examples/*/expected.txt` with a line per trigger of the Rust twin, and
+/// `examples/cookbook/*/expected.txt`, whose first line is the command. Fails if the twins of an
+/// example differ.
 pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     for file in GENERATED {
         let path = checkout.path(Path::new(file.path));
@@ -24,7 +26,10 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
         let text = file.text(&now).map_err(|why| Failure::new(Exit::Usage, why))?;
         write(checkout, Path::new(file.path), text)?;
     }
-    let mut steps = Steps::of(setup::STEPS + 1);
+    let mut steps = Steps::of(setup::STEPS + 2);
+    steps.begin("bindings of the Rust SDK");
+    let mut write_bindings = bindings::test(checkout);
+    steps::run(write_bindings.env("GLEANER_BLESS", "1"), "see the first error above")?;
     setup::run(checkout, &mut steps, &checkout.lambdas(&["examples"]))?;
     steps.begin(&format!("expected decisions on {DRIVE}"));
     for example in &EXAMPLES {

@@ -7,6 +7,7 @@
 mod aarch64;
 mod architecture;
 mod bench;
+mod bindings;
 mod bless;
 mod checkout;
 mod deb;

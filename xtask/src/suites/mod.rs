@@ -13,6 +13,7 @@ use std::time::Instant;
 
 use gleaner_base::{Exit, Failure};
 
+use crate::bindings;
 use crate::checkout::{Checkout, FAMILIES};
 use crate::fuzz;
 use crate::player;
@@ -133,6 +134,11 @@ fn suites(checkout: &Checkout) -> Vec<Suite> {
     let mut suites = vec![
         suite("cargo test", tests, OutputFormat::Libtest),
         suite("cargo test: seeds of the fuzz targets", seeds, OutputFormat::Libtest),
+        suite(
+            "cargo test: bindings of the Rust SDK",
+            bindings::test(checkout),
+            OutputFormat::Libtest,
+        ),
         suite("loom: orders of threads in gleaner-buffers", loom, OutputFormat::Libtest),
         Suite { name: "miri: memory in gleaner-buffers".to_owned(), action: miri(checkout) },
         suite("unittest: Python SDK", unittest, OutputFormat::Unittest),
