@@ -11,7 +11,7 @@ use clap::Args;
 use gleaner_base::{Exit, Failure};
 use gleaner_buffers::Pool;
 use gleaner_jail::Paths;
-use gleaner_lambda::manifest::{Manifest, Store};
+use gleaner_lambda::manifest::{InputSpec, Manifest, Store};
 use gleaner_lambda::{BuildDir, Fault};
 use gleaner_messages::Sources;
 use gleaner_protocol::ingress::TopicGrant;
@@ -143,33 +143,37 @@ fn topics(
     Ok((topics, notes))
 }
 
+/// Memory that the samples of an input need.
+fn input_needs(input: &InputSpec) -> Vec<Need> {
+    let (name, size) = (&input.name, input.max_size);
+    let TopicGrant { depth, holds, .. } = TopicGrant::for_input(0, input, "", false, false);
+    let held = u64::from(holds.windows) * u64::from(holds.window) + u64::from(holds.singles);
+    // One sample is written while the others are shown.
+    let shown = u64::from(depth) + 1;
+    let bytes = |samples: u64| Some(samples.saturating_mul(size.bytes()));
+    let place = NeedPlace::Memory;
+    let need = |preallocated, purpose, bytes| Need { purpose, bytes, place, preallocated };
+    let purpose = format!("input `{name}`: {shown} samples of {size}, shared by all lambdas");
+    let mut needs = vec![need(true, purpose, bytes(shown))];
+    let purpose = format!("input `{name}`: {held} samples that the lambda holds");
+    needs.push(need(false, purpose, bytes(held)));
+    if let Some(decoded) = input.decoded_size {
+        let slots = input.decoded_slots();
+        let bytes = Pool::<Info>::bytes_needed(slots, decoded.as_usize());
+        let purpose = format!("input `{name}`: {slots} decoded pictures of {decoded}");
+        needs.push(need(true, purpose, bytes.map(|bytes| bytes as u64)));
+    }
+    needs
+}
+
 /// Memory and disk that the lambda needs: its own process in the order of the manifest, then the
 /// recorder, then the disk.
 fn needs(lambda: &ConfiguredLambda, manifest: &Manifest) -> Vec<Need> {
     let limits = &manifest.limits;
-    let mut needs = Vec::new();
+    let mut needs: Vec<Need> = manifest.inputs.iter().flat_map(input_needs).collect();
     let mut need = |place, preallocated, purpose: String, bytes| {
         needs.push(Need { purpose, bytes, place, preallocated })
     };
-    for input in &manifest.inputs {
-        let name = &input.name;
-        let TopicGrant { depth, holds, .. } = TopicGrant::for_input(0, input, "", false, false);
-        let held = u64::from(holds.windows) * u64::from(holds.window) + u64::from(holds.singles);
-        let size = input.max_size;
-        let bytes = |samples: u64| Some(samples.saturating_mul(size.bytes()));
-        // One sample is written while the others are shown.
-        let shown = u64::from(depth) + 1;
-        let purpose = format!("input `{name}`: {shown} samples of {size}, shared by all lambdas");
-        need(NeedPlace::Memory, true, purpose, bytes(shown));
-        let purpose = format!("input `{name}`: {held} samples that the lambda holds");
-        need(NeedPlace::Memory, false, purpose, bytes(held));
-        if let Some(decoded) = input.decoded_size {
-            let slots = input.decoded_slots();
-            let bytes = Pool::<Info>::bytes_needed(slots, decoded.as_usize());
-            let purpose = format!("input `{name}`: {slots} decoded pictures of {decoded}");
-            need(NeedPlace::Memory, true, purpose, bytes.map(|bytes| bytes as u64));
-        }
-    }
     need(
         NeedPlace::Memory,
         false,

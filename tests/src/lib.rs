@@ -1,6 +1,7 @@
 //! Shared by the suites: paths of the checkout, replays, and drives made for tests.
 
 pub mod bag;
+pub mod budgets;
 pub mod cloud;
 pub mod drive;
 pub mod fake_messages;
@@ -11,6 +12,8 @@ pub mod parts;
 pub mod peers;
 pub mod random;
 pub mod rooms;
+#[path = "../../base/src/shared_data.rs"]
+mod shared_data;
 pub mod transcript;
 pub mod tree;
 pub mod vehicle;
@@ -27,6 +30,7 @@ use gleaner_lambda::manifest::Manifest;
 use gleaner_lambda::{Clip, Decision};
 use gleaner_protocol::{ReplaySummary, Report, Verified};
 use gleaner_report::format::{seconds, trigger_lines};
+pub use shared_data::shared_file;
 
 /// The checkout; of `gleaner-bench` in an unpacked tarball, the folder of the tarball, where all
 /// that it reads has the same place.
@@ -53,12 +57,6 @@ pub fn python_home() -> PathBuf {
 /// The recorded drive that comes with the project.
 pub fn sample_drive() -> PathBuf {
     root().join("examples/data/highway_drive.mcap")
-}
-
-/// A drive in the folder beside the checkout, which may be missing; then the reason.
-pub fn shared_drive(name: &str) -> Result<PathBuf, String> {
-    let path = root().join("../shared/data").join(name);
-    if path.is_file() { Ok(path) } else { Err(format!("no `{name}` in ../shared/data")) }
 }
 
 /// A program of the workspace: built into the same folder as this one, or of the same tarball.

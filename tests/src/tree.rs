@@ -57,7 +57,7 @@ pub fn files() -> Vec<File> {
 
 fn is_source_folder(root: &Path, folder: &str, name: &str) -> bool {
     match name {
-        ".ci" | ".cargo" => true,
+        ".ci" | ".cargo" | ".config" => true,
         "out" => !(folder.is_empty() || is_lambda(root, folder)),
         "build" => !is_lambda(root, folder),
         "__pycache__" => false,

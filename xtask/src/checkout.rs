@@ -92,15 +92,16 @@ impl Checkout {
     /// xtask, with all that depends on them.
     pub(crate) fn cargo(&self) -> Command {
         let mut cargo = self.command(&self.cargo);
-        let is_of_package = |name: &str| {
-            ["CARGO_MANIFEST_", "CARGO_PKG_"].iter().any(|start| name.starts_with(start))
-        };
-        for (name, _) in env::vars_os() {
-            if name.to_str().is_some_and(is_of_package) {
-                cargo.env_remove(name);
-            }
-        }
+        remove_package(&mut cargo);
         cargo
+    }
+
+    /// A command that runs a script of the checkout as a user would start it.
+    pub(crate) fn script(&self, script: &str) -> Command {
+        let mut command = Command::new(self.path(script));
+        remove_package(&mut command);
+        command.current_dir(&self.root);
+        command
     }
 
     /// The folders of the lambdas in `families`, relative to the checkout: all twins of each.
@@ -120,5 +121,16 @@ impl Checkout {
             twins.filter(|twin| self.path(twin).join("lambda.toml").is_file()).collect();
         lambdas.sort();
         lambdas
+    }
+}
+
+/// Removes the variables in which `cargo run` describes this package.
+fn remove_package(command: &mut Command) {
+    let is_of_package =
+        |name: &str| ["CARGO_MANIFEST_", "CARGO_PKG_"].iter().any(|start| name.starts_with(start));
+    for (name, _) in env::vars_os() {
+        if name.to_str().is_some_and(is_of_package) {
+            command.env_remove(name);
+        }
     }
 }

@@ -28,24 +28,34 @@ pub(crate) struct Example {
     to: Option<&'static str>,
     /// True if its decisions depend only on recent samples, so that a clip alone reproduces them.
     pub(crate) is_stateless: bool,
+    /// True if it runs a model, which needs `gleaner-inference`.
+    pub(crate) has_models: bool,
 }
 
 pub(crate) const EXAMPLES: [Example; 4] = [
-    Example { name: "hello", set: &["brake_mps2=-1.4"], to: None, is_stateless: true },
+    Example {
+        name: "hello",
+        set: &["brake_mps2=-1.4"],
+        to: None,
+        is_stateless: true,
+        has_models: false,
+    },
     Example {
         name: "brake-dark",
         set: &["brake_mps2=-1.4", "dark_luma=50"],
         to: None,
         is_stateless: true,
+        has_models: false,
     },
     // Its consecutive windows depend on the first sample of the drive.
-    Example { name: "imu-fft", set: &[], to: None, is_stateless: false },
+    Example { name: "imu-fft", set: &[], to: None, is_stateless: false, has_models: false },
     // Some 50 ms for each frame.
     Example {
         name: "yolo-detector",
         set: &["classes=car, truck"],
         to: Some("3"),
         is_stateless: true,
+        has_models: true,
     },
 ];
 

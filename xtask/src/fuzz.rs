@@ -150,10 +150,8 @@ impl Fuzz<'_> {
         for name in names {
             build.args(["--bin", &format!("fuzz-{name}")]);
         }
-        build.args([
-            "--features",
-            if names.contains(&CALLS) { "programs,calls" } else { "programs" },
-        ]);
+        build.args(["--no-default-features", "--features"]);
+        build.arg(if names.contains(&CALLS) { "programs,calls" } else { "programs" });
         build
             .env("CARGO_TARGET_DIR", &self.build)
             .env("RUSTFLAGS", FLAGS)
@@ -166,18 +164,7 @@ impl Fuzz<'_> {
     }
 
     fn seeds(&self) -> Result<(), Failure> {
-        let mut build = self.checkout.cargo();
-        // With the features of the default build, so that nothing is built twice.
-        build.args([
-            "build",
-            "--release",
-            "--workspace",
-            "--exclude",
-            "gleaner-player",
-            "--bin",
-            "fuzz-seeds",
-        ]);
-        steps::run(&mut build, "see the first error above")?;
+        setup::binary(self.checkout, "fuzz-seeds")?;
         let mut seeds = self.checkout.command(self.checkout.program("fuzz-seeds"));
         steps::run(seeds.arg(self.build.join("seeds")), "see the error above")
     }

@@ -18,9 +18,11 @@ mod examples;
 mod fleet;
 mod fuzz;
 mod glibc;
+mod metadata;
 mod page;
 mod peers;
 mod player;
+mod records;
 mod revisions;
 mod setup;
 mod steps;
@@ -40,9 +42,13 @@ use checkout::{Checkout, FAMILIES};
 use steps::Steps;
 
 const USAGE: &str = "usage: cargo xtask COMMAND
-  demo     replay the sample drive with both twins of every example, then run them on a vehicle by
-           a cloud, whose page stays open until Ctrl-C; --no-wait ends after the checks
-  test     run all tests; the last line is `N passed, M failed, K skipped`
+  demo     replay the sample drive with both twins of every example, then run them on a vehicle of
+           a cloud, whose page stays open until Ctrl-C; --no-wait ends after the checks, --no-fleet
+           leaves the cloud out
+  test     run all tests; the last line is `N passed, M failed, K skipped`; --shared runs those
+           that read GLEANER_SHARED, and those of the pages
+  full     run every part of .ci/run, and record the heavy ones in .ci/full.json
+  record   print the record of the heavy part NAME, if its sources are the same as then
   bless    write the examples' decisions to expected.txt, and the generated files
   docs     fetch mdBook and build the pages as a book in target/book
   bench    run a benchmark: rtt, scale, isolation, cold-start, replay, record, drives, kernels,
@@ -76,8 +82,19 @@ fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
         Some((command, rest)) => (command.to_str().unwrap_or_default(), rest),
         None => ("", &[][..]),
     };
-    let has_arguments =
-        ["bench", "deb", "demo", demo::VEHICLE_COMMAND, "dist", "fleet", "fuzz", "page", "peers"];
+    let has_arguments = [
+        "bench",
+        "deb",
+        "demo",
+        demo::VEHICLE_COMMAND,
+        "dist",
+        "fleet",
+        "fuzz",
+        "page",
+        "peers",
+        "record",
+        "test",
+    ];
     if !rest.is_empty() && !has_arguments.contains(&command) {
         return Err(Failure::new(
             Exit::Usage,
@@ -89,7 +106,9 @@ fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
     match command {
         "demo" => demo::run(&checkout, rest),
         demo::VEHICLE_COMMAND => demo::run_vehicle(&checkout, rest),
-        "test" => suites::run(&checkout),
+        "full" => records::full(&checkout),
+        "record" => records::print(&checkout, rest),
+        "test" => suites::run(&checkout, rest),
         "bless" => bless::run(&checkout),
         "docs" => docs::run(&checkout),
         "bench" => bench::run(&checkout, rest),

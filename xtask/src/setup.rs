@@ -11,6 +11,18 @@ use crate::venv;
 /// The number of steps that [`run`] takes.
 pub(crate) const STEPS: usize = 4;
 
+/// The programs that a replay needs, besides the extension module for Python.
+const FOR_REPLAYS: [&str; 4] = ["gleaner", "gleaner-compile", "gleaner-runtime", "gleaner-shim"];
+
+/// The programs that a vehicle needs besides.
+const ON_VEHICLES: [&str; 5] = [
+    "gleaner-inference",
+    "gleaner-ingress",
+    "gleaner-orchestrator",
+    "gleaner-recorder",
+    "gleaner-supervisor",
+];
+
 /// Compilation target of Rust lambdas.
 pub(crate) const TARGET: &str = "wasm32-wasip2";
 
@@ -34,6 +46,24 @@ pub(crate) fn run(
     checkout: &Checkout,
     steps: &mut Steps,
     lambdas: &[PathBuf],
+) -> Result<(), Failure> {
+    run_with(checkout, steps, lambdas, programs)
+}
+
+/// Sets up the same, but only the programs that a replay needs.
+pub(crate) fn run_for_replays(
+    checkout: &Checkout,
+    steps: &mut Steps,
+    lambdas: &[PathBuf],
+) -> Result<(), Failure> {
+    run_with(checkout, steps, lambdas, replay_programs)
+}
+
+fn run_with(
+    checkout: &Checkout,
+    steps: &mut Steps,
+    lambdas: &[PathBuf],
+    programs: impl FnOnce(&Checkout) -> Result<(), Failure>,
 ) -> Result<(), Failure> {
     steps.begin(&format!("compilation target {TARGET}"));
     target(checkout, TARGET)?;
@@ -67,10 +97,34 @@ pub(crate) fn target(checkout: &Checkout, target: &str) -> Result<(), Failure> {
 /// Builds all programs in one call, even those that a command does not need: shared crates then
 /// have the features of `cargo test`, and nothing heavy compiles twice.
 pub(crate) fn programs(checkout: &Checkout) -> Result<(), Failure> {
+    build(checkout, &PROGRAMS, &[])
+}
+
+/// Builds what a replay needs, with the features of [`programs`].
+pub(crate) fn replay_programs(checkout: &Checkout) -> Result<(), Failure> {
+    build(checkout, &PROGRAMS, &FOR_REPLAYS)?;
+    // Only a library can be an extension module, and cargo builds those of all named packages.
+    build(checkout, &["gleaner-python", "gleaner-features"], &["--lib"])
+}
+
+/// Builds what a vehicle needs besides, with the features of [`programs`].
+pub(crate) fn vehicle_programs(checkout: &Checkout) -> Result<(), Failure> {
+    build(checkout, &PROGRAMS, &ON_VEHICLES)
+}
+
+/// Builds programs of these packages: those that are named, or all. `--lib` stands for libraries.
+fn build(checkout: &Checkout, packages: &[&str], programs: &[&str]) -> Result<(), Failure> {
     let mut build = checkout.cargo();
     build
         .args(["build", "--release"])
-        .args(PROGRAMS.iter().flat_map(|package| ["--package", package]));
+        .args(packages.iter().flat_map(|package| ["--package", package]));
+    for program in programs {
+        if program.starts_with("--") {
+            build.arg(program)
+        } else {
+            build.args(["--bin", program])
+        };
+    }
     steps::run(
         &mut build,
         "if a linker or a C compiler is missing, install one (`cc`); else see the first error \
@@ -95,40 +149,4 @@ pub(crate) fn build_lambdas(checkout: &Checkout, folders: &[PathBuf]) -> Result<
         steps::run(&mut build, "see the error above")?;
     }
     Ok(())
-}
-
-#[cfg(test)]
-mod tests {
-    use std::collections::BTreeSet;
-    use std::env;
-    use std::process::Command;
-
-    use super::*;
-
-    /// Each package that cargo builds for `selected`, with its features; `edges` are the kinds of
-    /// dependencies that count.
-    fn packages(edges: &str, selected: &[&str]) -> BTreeSet<String> {
-        let cargo = env::var_os("CARGO").expect("cargo runs the tests");
-        let mut tree = Command::new(cargo);
-        tree.current_dir(Path::new(env!("CARGO_MANIFEST_DIR")).join(".."));
-        tree.args([
-            "tree", "--locked", "--edges", edges, "--prefix", "none", "--format", "{p} {f}",
-        ]);
-        tree.args(selected.iter().flat_map(|package| ["--package", package]));
-        let output = tree.output().expect("cargo starts");
-        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-        let lines = String::from_utf8(output.stdout).expect("names are text");
-        lines.lines().map(|line| line.trim_end_matches(" (*)").to_owned()).collect()
-    }
-
-    #[test]
-    fn tests_reuse_the_build_of_the_programs() {
-        let (programs, all) =
-            (packages("normal,build", &PROGRAMS), packages("normal,build,dev", &[]));
-        assert!(programs.len() > 100, "{}", programs.len());
-        // Cargo selects features by what it builds: a feature that only a test enables rebuilds
-        // everything that uses it.
-        let again: Vec<_> = programs.difference(&all).collect();
-        assert!(again.is_empty(), "with other features in `cargo test`: {again:#?}");
-    }
 }

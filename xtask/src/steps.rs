@@ -1,8 +1,9 @@
-//! Runs the steps of a command: prints each one before it begins, shows the output of its tool, and
-//! gives help if it fails.
+//! Runs the steps of a command: prints each one before it begins, and the seconds that it took,
+//! shows the output of its tool, and gives help if it fails.
 
 use std::io::{self, Write};
 use std::process::{Command, Output, Stdio};
+use std::time::Instant;
 
 use gleaner_base::{Exit, Failure};
 
@@ -12,19 +13,30 @@ use crate::checkout::Checkout;
 pub(crate) struct Steps {
     started: usize,
     total: usize,
+    began: Instant,
 }
 
 impl Steps {
     pub(crate) fn of(total: usize) -> Steps {
-        Steps { started: 0, total }
+        Steps { started: 0, total, began: Instant::now() }
     }
 
-    /// Prints the next step.
+    /// Ends the step before, and prints the next one.
     pub(crate) fn begin(&mut self, what: &str) {
+        self.end();
         self.started += 1;
+        self.began = Instant::now();
         println!("[{}/{}] {what}", self.started, self.total);
         // Flushed, so that output of the tool comes after it.
         let _ = io::stdout().flush();
+    }
+
+    /// Prints the seconds of the current step, if one has begun.
+    pub(crate) fn end(&self) {
+        if self.started > 0 {
+            let seconds = self.began.elapsed().as_secs_f64();
+            println!("[{}/{}] took {seconds:.1} s", self.started, self.total);
+        }
     }
 }
 

@@ -9,10 +9,12 @@ use gleaner_fleet::people::{FleetDeployment, ListPage};
 use hyper::Method;
 use tokio::time::{Instant, sleep, timeout};
 
+use crate::administrator::Administrator;
 use crate::figure::{at_most, free};
 use crate::fleet::EnrolledFleet;
+use crate::identity::SimulatedIdentity;
 use crate::release::SignedRelease;
-use crate::simulation::FleetLoad;
+use crate::simulation::{FleetLoad, Simulation};
 use crate::vehicle::{be_silent, open};
 
 /// Longest pause between attempts to connect, as of a real vehicle.
@@ -64,20 +66,9 @@ pub async fn figures(count: usize, times: &LoadTimes) -> Result<Vec<Figure>, Str
     add(at_most("memory per idle vehicle", "kB", 20.0, idle_kb));
 
     let silent: Vec<_> = fleet.vehicles[count..count + SILENT].to_vec();
-    let silent = silent.into_iter().filter(|_| times.has_silent).map(|identity| {
-        let simulation = Arc::clone(&simulation);
-        tokio::spawn(async move {
-            let begun = Instant::now();
-            let end = timeout(PATIENCE, be_silent(&identity, &simulation)).await;
-            match end {
-                Ok(Ok(reason)) if reason == "no sign of life" => begun.elapsed().as_secs_f64(),
-                other => {
-                    simulation.error(format!("a silent connection: {other:?}"));
-                    f64::INFINITY
-                }
-            }
-        })
-    });
+    let silent = silent.into_iter().filter(|_| times.has_silent);
+    let silent =
+        silent.map(|identity| tokio::spawn(measure_silence(identity, Arc::clone(&simulation))));
     let silent: Vec<_> = silent.collect();
 
     let (cpu_s, reports) = (cloud.cpu_s(), simulation.reports.load(Relaxed));
@@ -100,16 +91,7 @@ pub async fn figures(count: usize, times: &LoadTimes) -> Result<Vec<Figure>, Str
 
     let mut administrator = fleet.administrator().await?;
     let cpu_s = cloud.cpu_s();
-    let release = simulation.begun.elapsed().as_secs() + 1;
-    simulation.await_release(release);
-    SignedRelease::new(release, None)?.deploy(&mut administrator).await?;
-    let most = count * 99 / 100;
-    simulation.until(PATIENCE, |it| it.applied_s().len() >= most).await;
-    let applied = simulation.applied_s();
-    let p99 = match applied.len() >= most {
-        true => quantile(&applied, most as f64 / applied.len() as f64),
-        false => f64::INFINITY,
-    };
+    let p99 = measure_deployment(count, &simulation, &mut administrator).await?;
     add(at_most("a deployment is applied by 99 % after", "s", 30.0, p99));
     add(free("CPU of the cloud for it", "s", cloud.cpu_s() - cpu_s));
     simulation.until(PATIENCE, |it| it.applied_s().len() >= count).await;
@@ -123,14 +105,7 @@ pub async fn figures(count: usize, times: &LoadTimes) -> Result<Vec<Figure>, Str
     }
 
     let revoked = &fleet.vehicles[count + SILENT];
-    let (mut socket, _) = open(revoked, &simulation).await?;
-    let begun = Instant::now();
-    let path = format!("/v1/vehicles/{}", revoked.name);
-    administrator.bytes(Method::DELETE, &path, None, Vec::new()).await?;
-    let ended =
-        async { while let Some(Ok(_)) = futures_util::StreamExt::next(&mut socket).await {} };
-    let cut_s =
-        timeout(PATIENCE, ended).await.map_or(f64::INFINITY, |()| begun.elapsed().as_secs_f64());
+    let cut_s = measure_removal(revoked, &simulation, &mut administrator).await?;
     add(at_most("a vehicle that is removed is cut off after", "s", 5.0, cut_s));
     let mut silent_s = Vec::new();
     for link in silent {
@@ -142,4 +117,51 @@ pub async fn figures(count: usize, times: &LoadTimes) -> Result<Vec<Figure>, Str
     }
     add(at_most("errors", "", 0.0, simulation.errors() + simulation.losses()));
     Ok(figures)
+}
+
+/// Returns the time in s after which the connection of a silent vehicle is ended.
+async fn measure_silence(identity: SimulatedIdentity, simulation: Arc<Simulation>) -> f64 {
+    let begun = Instant::now();
+    let end = timeout(PATIENCE, be_silent(&identity, &simulation)).await;
+    match end {
+        Ok(Ok(reason)) if reason == "no sign of life" => begun.elapsed().as_secs_f64(),
+        other => {
+            simulation.error(format!("a silent connection: {other:?}"));
+            f64::INFINITY
+        }
+    }
+}
+
+/// Makes a deployment; returns the time in s after which 99 % of `count` vehicles report it.
+async fn measure_deployment(
+    count: usize,
+    simulation: &Simulation,
+    administrator: &mut Administrator,
+) -> Result<f64, String> {
+    let release = simulation.begun.elapsed().as_secs() + 1;
+    simulation.await_release(release);
+    SignedRelease::new(release, None)?.deploy(administrator).await?;
+    let most = count * 99 / 100;
+    simulation.until(PATIENCE, |it| it.applied_s().len() >= most).await;
+    let applied = simulation.applied_s();
+    Ok(match applied.len() >= most {
+        true => quantile(&applied, most as f64 / applied.len() as f64),
+        false => f64::INFINITY,
+    })
+}
+
+/// Removes a vehicle; returns the time in s after which its connection is ended.
+async fn measure_removal(
+    identity: &SimulatedIdentity,
+    simulation: &Simulation,
+    administrator: &mut Administrator,
+) -> Result<f64, String> {
+    let (mut socket, _) = open(identity, simulation).await?;
+    let begun = Instant::now();
+    let path = format!("/v1/vehicles/{}", identity.name);
+    administrator.bytes(Method::DELETE, &path, None, Vec::new()).await?;
+    let ended =
+        async { while let Some(Ok(_)) = futures_util::StreamExt::next(&mut socket).await {} };
+    let ended = timeout(PATIENCE, ended).await;
+    Ok(ended.map_or(f64::INFINITY, |()| begun.elapsed().as_secs_f64()))
 }

@@ -24,10 +24,34 @@ pub struct ScaleOptions {
     only: Option<String>,
 }
 
+impl ScaleOptions {
+    fn is_wanted(&self, name: &str) -> bool {
+        self.only.as_deref().is_none_or(|only| name.contains(only))
+    }
+}
+
 /// Samples that one and several lambdas receive, and their costs.
 pub fn loads(quick: bool, options: &ScaleOptions, results: &mut BenchResults) {
-    let is_wanted = |name: &str| options.only.as_deref().is_none_or(|only| name.contains(only));
-    let seconds = |long: u32| if quick { 2 } else { long };
+    measure_single(quick, options, &mut results.figures);
+    let mut scales = scales(quick);
+    if !quick {
+        if let Err(why) = PacketLoss::of(1) {
+            results.notes.push(format!("Loss of packets is skipped: {why}."));
+        } else {
+            scales.extend(loss_scales());
+        }
+    }
+    let seconds = if quick { 2 } else { 16 };
+    let wanted = scales.iter().filter(|scale| options.is_wanted(&scale.name));
+    wanted.for_each(|scale| scale.measure(seconds, results));
+    if results.figures.is_empty() {
+        let only = options.only.as_deref().unwrap_or_default();
+        results.notes.push(format!("All loads are skipped: none has \"{only}\" in its name."));
+    }
+}
+
+/// Measures usual loads of cameras and IMUs.
+fn measure_single(quick: bool, options: &ScaleOptions, figures: &mut Vec<Figure>) {
     const FULL_HD: &str = "1920x1080@30";
     let rig: [&[&str]; 2] =
         [&["--synthetic", FULL_HD, "--imu", "1000"], &["--synthetic", FULL_HD, "--remap", REAR]];
@@ -45,17 +69,18 @@ pub fn loads(quick: bool, options: &ScaleOptions, results: &mut BenchResults) {
         // player.
         ("two cameras of 1080p at 30 Hz and an IMU at 1 kHz at once", &[("rig", 1)], &rig, 60),
     ];
-    for (name, lambdas, players, long) in single.into_iter().filter(|load| is_wanted(load.0)) {
-        let seconds = seconds(long);
+    let wanted = single.into_iter().filter(|load| options.is_wanted(load.0));
+    for (name, lambdas, players, long) in wanted {
+        let seconds = if quick { 2 } else { long };
         let name = name.to_owned();
         let (more_topics, kind, is_lossy) = (0, Twin::Rust, false);
         let load = Load { name, lambdas, more_topics, kind, players, seconds, is_lossy };
-        load.measure(&mut results.figures);
+        load.measure(figures);
     }
-    let seconds = seconds(16);
-    let imu = |rate: u32| vec!["--imu".to_owned(), rate.to_string()];
-    let full_hd = |rate: u32| raw_camera("1920x1080", rate);
-    let one = |lambda, player| ScaleLoad::of(lambda, 1, vec![player]);
+}
+
+/// Returns loads of growing numbers: of lambdas, topics, samples and rows of an image.
+fn scales(quick: bool) -> Vec<Scale> {
     let cameras = |rate: u32| Scale {
         name: format!("1080p at {rate} Hz"),
         of: "lambdas",
@@ -70,14 +95,14 @@ pub fn loads(quick: bool, options: &ScaleOptions, results: &mut BenchResults) {
         of: "lambdas",
         places: if quick { &[4] } else { &[1, 10, 25, 50] },
         is_flat: true,
-        load: Box::new(move |count| ScaleLoad::of("imu", count, vec![imu(1000)])),
+        load: Box::new(|count| ScaleLoad::of("imu", count, vec![imu(1000)])),
     });
     scales.push(Scale {
         name: "one lambda on IMUs at 100 Hz, woken by the first".to_owned(),
         of: "topics",
         places: if quick { &[2] } else { &[1, 2, 4, 8, 16] },
         is_flat: true,
-        load: Box::new(move |topics| {
+        load: Box::new(|topics| {
             let remap = |number| {
                 vec!["--remap".to_owned(), format!("/imu/synthetic:={}", more_imu(number))]
             };
@@ -92,45 +117,47 @@ pub fn loads(quick: bool, options: &ScaleOptions, results: &mut BenchResults) {
             of: "samples per second",
             places: &[100, 500, 1000, 2000, 5000],
             is_flat: false,
-            load: Box::new(move |rate| one("imu", imu(rate))),
+            load: Box::new(|rate| ScaleLoad::of("imu", 1, vec![imu(rate)])),
         });
         scales.push(Scale {
             name: "one lambda on a camera at 10 Hz".to_owned(),
             of: "rows of an image of 16:9",
             places: &[720, 1080, 1440, 2160],
             is_flat: false,
-            load: Box::new(move |rows| {
-                one("camera", raw_camera(&format!("{}x{rows}", rows * 16 / 9), 10))
+            load: Box::new(|rows| {
+                let player = raw_camera(&format!("{}x{rows}", rows * 16 / 9), 10);
+                ScaleLoad::of("camera", 1, vec![player])
             }),
         });
-        let of_loss = |name: &str, lambda: &'static str, player: Vec<String>| Scale {
-            name: name.to_owned(),
-            of: "dropped packets in 1,000",
-            places: &[0, 1, 10, 50],
-            is_flat: false,
-            load: Box::new(move |dropped| ScaleLoad { dropped, ..one(lambda, player.clone()) }),
-        };
-        if let Err(why) = PacketLoss::of(1) {
-            results.notes.push(format!("Loss of packets is skipped: {why}."));
-        } else {
-            scales.push(of_loss(
-                "one lambda on an IMU at 1 kHz, with lost packets",
-                "imu",
-                imu(1000),
-            ));
-            scales.push(of_loss(
-                "one lambda on 1080p at 10 Hz, with lost packets",
-                "camera",
-                full_hd(10),
-            ));
-        }
     }
-    let wanted = scales.iter().filter(|scale| is_wanted(&scale.name));
-    wanted.for_each(|scale| scale.measure(seconds, results));
-    if results.figures.is_empty() {
-        let only = options.only.as_deref().unwrap_or_default();
-        results.notes.push(format!("All loads are skipped: none has \"{only}\" in its name."));
-    }
+    scales
+}
+
+/// Returns loads of which a growing number of packets is lost.
+fn loss_scales() -> [Scale; 2] {
+    let of_loss = |name: &str, lambda: &'static str, player: Vec<String>| Scale {
+        name: name.to_owned(),
+        of: "dropped packets in 1,000",
+        places: &[0, 1, 10, 50],
+        is_flat: false,
+        load: Box::new(move |dropped| ScaleLoad {
+            dropped,
+            ..ScaleLoad::of(lambda, 1, vec![player.clone()])
+        }),
+    };
+    [
+        of_loss("one lambda on an IMU at 1 kHz, with lost packets", "imu", imu(1000)),
+        of_loss("one lambda on 1080p at 10 Hz, with lost packets", "camera", full_hd(10)),
+    ]
+}
+
+/// Arguments of a player of IMU samples.
+fn imu(rate: u32) -> Vec<String> {
+    vec!["--imu".to_owned(), rate.to_string()]
+}
+
+fn full_hd(rate: u32) -> Vec<String> {
+    raw_camera("1920x1080", rate)
 }
 
 /// Arguments of a player of raw images.

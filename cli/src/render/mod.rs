@@ -233,20 +233,7 @@ fn write_summary(
     }
     more(text, digest.other_triggers)?;
 
-    if summary.faults > 0 {
-        writeln!(text, "  {}", paint.red(&counted(summary.faults, "fault")))?;
-        for cause in &digest.fault_groups {
-            let kind = fault_kind(cause.kind);
-            writeln!(
-                text,
-                "{:>10.3} s  {}x {kind}: {}",
-                cause.first_seconds,
-                grouped(cause.count),
-                cause.message
-            )?;
-        }
-        more(text, digest.other_faults)?;
-    }
+    write_faults(text, summary.faults, digest, paint)?;
     clips::write(text, clips, summary, paint)?;
     write_counted(text, &summary.recording, paint)?;
     if summary.clips_replaced > 0 {
@@ -264,20 +251,7 @@ fn write_summary(
             paint.yellow(&format!("out of order: {messages} came after one with a later log time"))
         )?;
     }
-    if let Some(damage) = &summary.damaged {
-        writeln!(text, "  {}", paint.red("the drive is damaged; the results end there"))?;
-        for line in damage.lines() {
-            writeln!(text, "    {}", visible(line))?;
-        }
-    }
-    if let Some(why) = &summary.stopped {
-        writeln!(
-            text,
-            "  {}",
-            paint.red("the lambda's process ended before the drive; the results end there")
-        )?;
-        writeln!(text, "    {}", visible(why))?;
-    }
+    write_early_end(text, summary, paint)?;
 
     if !summary.part.is_all() {
         let [from_s, to_s] = [from_ns, to_ns].map(|ns| seconds(ns, summary.start_ns));
@@ -306,6 +280,40 @@ fn write_summary(
         visible(&summary.out.to_string_lossy())
     );
     writeln!(text, "  {}", paint.dim(&files))
+}
+
+fn write_faults(text: &mut String, faults: u64, digest: &Digest, paint: Paint) -> fmt::Result {
+    if faults == 0 {
+        return Ok(());
+    }
+    writeln!(text, "  {}", paint.red(&counted(faults, "fault")))?;
+    for cause in &digest.fault_groups {
+        let kind = fault_kind(cause.kind);
+        writeln!(
+            text,
+            "{:>10.3} s  {}x {kind}: {}",
+            cause.first_seconds,
+            grouped(cause.count),
+            cause.message
+        )?;
+    }
+    more(text, digest.other_faults)
+}
+
+/// Writes the reason why the results end before the drive, if they do.
+fn write_early_end(text: &mut String, summary: &ReplaySummary, paint: Paint) -> fmt::Result {
+    if let Some(damage) = &summary.damaged {
+        writeln!(text, "  {}", paint.red("the drive is damaged; the results end there"))?;
+        for line in damage.lines() {
+            writeln!(text, "    {}", visible(line))?;
+        }
+    }
+    if let Some(why) = &summary.stopped {
+        let what = "the lambda's process ended before the drive; the results end there";
+        writeln!(text, "  {}", paint.red(what))?;
+        writeln!(text, "    {}", visible(why))?;
+    }
+    Ok(())
 }
 
 /// Writes a line for each cause of data that the recorder did not record.

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use gleaner_base::{Exit, Failure};
+use rustls::ServerConfig;
 use tokio::net::TcpListener;
 use tokio::sync::{Semaphore, watch};
 use tokio::task::JoinSet;
@@ -83,6 +84,28 @@ impl ServeOptions {
             is_behind_proxy: false,
         }
     }
+
+    /// Refuses to serve people of other machines without TLS, unless that is permitted.
+    fn check_people(&self) -> Result<(), Failure> {
+        if self.people.ip().is_loopback() || self.is_insecure {
+            return Ok(());
+        }
+        let message = format!("people are not served at {} without TLS", self.people);
+        Err(Failure::new(Exit::Denied, message).with_help(
+            "use a loopback address and put a proxy with TLS before it, or add \
+             --insecure-people in a network that you trust",
+        ))
+    }
+
+    /// Refuses a bus and shared files without a database that replicas share.
+    fn check_shared(&self) -> Result<(), Failure> {
+        if self.store.is_some() || (self.bus.is_none() && self.objects.is_none()) {
+            return Ok(());
+        }
+        let message = "--bus and --objects are for several processes over one database";
+        Err(Failure::new(Exit::Usage, message)
+            .with_help("add --store postgres://USER@HOST/DATABASE, or leave them out"))
+    }
 }
 
 /// A server that runs.
@@ -108,20 +131,10 @@ impl CloudServer {
     ///
     /// A failure that names the folder, the file or the address that cannot be used.
     pub async fn start(options: &ServeOptions) -> Result<Self, Failure> {
-        if !options.people.ip().is_loopback() && !options.is_insecure {
-            let message = format!("people are not served at {} without TLS", options.people);
-            return Err(Failure::new(Exit::Denied, message).with_help(
-                "use a loopback address and put a proxy with TLS before it, or add \
-                 --insecure-people in a network that you trust",
-            ));
-        }
+        options.check_people()?;
         let folder = DataFolder::create(&options.data)?;
         let lock = folder.lock()?;
-        if options.store.is_none() && (options.bus.is_some() || options.objects.is_some()) {
-            let message = "--bus and --objects are for several processes over one database";
-            return Err(Failure::new(Exit::Usage, message)
-                .with_help("add --store postgres://USER@HOST/DATABASE, or leave them out"));
-        }
+        options.check_shared()?;
         let bus = options.bus.as_deref().map(BusAddress::parse).transpose()?;
         let bucket = options.objects.as_deref().map(S3Bucket::parse).transpose()?;
         let objects = bucket.as_ref().map(S3Bucket::url).unwrap_or_default();
@@ -182,26 +195,10 @@ impl CloudServer {
         let (failure, failed) = watch::channel(None);
         let is_alone = bucket.is_none();
         let mut entrances = JoinSet::new();
-        let entrance = Entrance {
-            listener: people_listener,
-            router: people::router(&cloud),
-            tls: None,
-            most: PEOPLE_MAX,
-            most_of_one: PEOPLE_OF_ONE_MAX,
-            is_behind_proxy: options.is_behind_proxy,
-            stop: stopped.clone(),
-        };
+        let is_behind_proxy = options.is_behind_proxy;
+        let entrance = people_entrance(people_listener, &cloud, is_behind_proxy, stopped.clone());
         entrances.spawn(entrance.serve());
-        let entrance = Entrance {
-            listener: vehicles_listener,
-            router: vehicles::router(&cloud),
-            tls: Some(tls_config),
-            most: VEHICLES_MAX,
-            // Many can be behind one address of a mobile network, or behind a balancer.
-            most_of_one: VEHICLES_MAX,
-            is_behind_proxy: false,
-            stop: stopped,
-        };
+        let entrance = vehicles_entrance(vehicles_listener, &cloud, tls_config, stopped);
         entrances.spawn(entrance.serve());
         // Each has a task of its own: one that waits for the database must not hold it up.
         if cloud.store.is_shared() {
@@ -210,41 +207,9 @@ impl CloudServer {
             let working = Arc::clone(&cloud);
             chores.spawn(async move { replicas::follow(&working, hints).await });
         }
+        spawn_chores(&mut chores, &cloud);
         let working = Arc::clone(&cloud);
-        chores.spawn(async move { clips::clean(&working).await });
-        let working = Arc::clone(&cloud);
-        chores.spawn(async move { objects::collect(&working).await });
-        let working = Arc::clone(&cloud);
-        chores.spawn(async move { records::keep(&working).await });
-        let working = Arc::clone(&cloud);
-        chores.spawn(async move { tails::keep(&working).await });
-        let working = Arc::clone(&cloud);
-        chores.spawn(async move {
-            let mut ticks = ticks(SEEN_INTERVAL);
-            loop {
-                ticks.tick().await;
-                store_seen(&working).await;
-            }
-        });
-        let working = Arc::clone(&cloud);
-        chores.spawn(async move {
-            let mut ticks = ticks(WAVES_INTERVAL);
-            loop {
-                ticks.tick().await;
-                advance_waves(&working).await;
-            }
-        });
-        let working = Arc::clone(&cloud);
-        chores.spawn(async move {
-            let mut ticks = ticks(CERTIFICATE_INTERVAL);
-            loop {
-                ticks.tick().await;
-                match working.authorities.server_config(&host) {
-                    Ok(config) => drop(tls.send_replace(config)),
-                    Err(failure) => tracing::error!("{failure}"),
-                }
-            }
-        });
+        chores.spawn(async move { renew_certificate(&working, &host, &tls).await });
         Ok(Self { people, vehicles, code, cloud, failed, stop, entrances, chores, _lock: lock })
     }
 
@@ -276,11 +241,73 @@ impl CloudServer {
     }
 }
 
+/// Returns the entrance of people.
+fn people_entrance(
+    listener: TcpListener,
+    cloud: &Arc<Cloud>,
+    is_behind_proxy: bool,
+    stop: watch::Receiver<bool>,
+) -> Entrance {
+    Entrance {
+        listener,
+        router: people::router(cloud),
+        tls: None,
+        most: PEOPLE_MAX,
+        most_of_one: PEOPLE_OF_ONE_MAX,
+        is_behind_proxy,
+        stop,
+    }
+}
+
+/// Returns the entrance of vehicles.
+fn vehicles_entrance(
+    listener: TcpListener,
+    cloud: &Arc<Cloud>,
+    tls: watch::Receiver<Arc<ServerConfig>>,
+    stop: watch::Receiver<bool>,
+) -> Entrance {
+    Entrance {
+        listener,
+        router: vehicles::router(cloud),
+        tls: Some(tls),
+        most: VEHICLES_MAX,
+        // Many can be behind one address of a mobile network, or behind a balancer.
+        most_of_one: VEHICLES_MAX,
+        is_behind_proxy: false,
+        stop,
+    }
+}
+
+/// Spawns the chores that a cloud has with and without replicas.
+fn spawn_chores(chores: &mut JoinSet<()>, cloud: &Arc<Cloud>) {
+    let working = Arc::clone(cloud);
+    chores.spawn(async move { clips::clean(&working).await });
+    let working = Arc::clone(cloud);
+    chores.spawn(async move { objects::collect(&working).await });
+    let working = Arc::clone(cloud);
+    chores.spawn(async move { records::keep(&working).await });
+    let working = Arc::clone(cloud);
+    chores.spawn(async move { tails::keep(&working).await });
+    let working = Arc::clone(cloud);
+    chores.spawn(async move { keep_seen(&working).await });
+    let working = Arc::clone(cloud);
+    chores.spawn(async move { advance_waves(&working).await });
+}
+
 /// Returns ticks, now and then after each interval. One that comes late moves those after it.
 fn ticks(period: Duration) -> Interval {
     let mut ticks = interval(period);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     ticks
+}
+
+/// Stores the last signs of life, for as long as this process runs.
+async fn keep_seen(cloud: &Cloud) {
+    let mut ticks = ticks(SEEN_INTERVAL);
+    loop {
+        ticks.tick().await;
+        store_seen(cloud).await;
+    }
 }
 
 async fn store_seen(cloud: &Cloud) {
@@ -289,10 +316,27 @@ async fn store_seen(cloud: &Cloud) {
     }
 }
 
+/// Advances the waves of releases, for as long as this process runs.
 async fn advance_waves(cloud: &Cloud) {
-    match cloud.store.advance_waves().await {
-        Ok(changed) => cloud.hub.wake(&changed),
-        Err(error) => tracing::warn!(reason = error.reason(), "waves do not go on"),
+    let mut ticks = ticks(WAVES_INTERVAL);
+    loop {
+        ticks.tick().await;
+        match cloud.store.advance_waves().await {
+            Ok(changed) => cloud.hub.wake(&changed),
+            Err(error) => tracing::warn!(reason = error.reason(), "waves do not go on"),
+        }
+    }
+}
+
+/// Makes the server's certificate again and again, for as long as this process runs.
+async fn renew_certificate(cloud: &Cloud, host: &str, tls: &watch::Sender<Arc<ServerConfig>>) {
+    let mut ticks = ticks(CERTIFICATE_INTERVAL);
+    loop {
+        ticks.tick().await;
+        match cloud.authorities.server_config(host) {
+            Ok(config) => drop(tls.send_replace(config)),
+            Err(failure) => tracing::error!("{failure}"),
+        }
     }
 }
 

@@ -5,6 +5,7 @@ then `pytest examples/cookbook`.
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,10 @@ from gleaner.testing import Run, StartError, replay
 
 COOKBOOK = Path(__file__).resolve().parents[1]
 SAMPLE = COOKBOOK.parent / "data" / "highway_drive.mcap"
-SHARED = COOKBOOK.parents[2] / "shared" / "data"
 RECIPES = sorted(path.parent.name for path in COOKBOOK.glob("*/main.py"))
+
+sys.path.append(str(COOKBOOK.parent))
+from shared_data import shared  # noqa: E402
 
 IMU = "/imu/data"
 SPEED = "/vehicle/speed"
@@ -47,9 +50,7 @@ def test_a_local_run_of_a_recipe_agrees_with_expected_txt(name: str) -> None:
 def test_four_lane_changes_are_four_swerves() -> None:
     # The two hard ones to the right are labelled in the data set, at 16.1 to 18.5 s and 25.1 to
     # 27.6 s.
-    drive = SHARED / "rec_brake_imu_trip17.mcap"
-    if not drive.exists():
-        pytest.skip(f"{drive.name} is not distributed with the project; put it into ../shared/data")
+    drive = shared("rec_brake_imu_trip17.mcap")
     assert times(run("swerve", drive)) == pytest.approx([13.13, 17.12, 22.2, 26.25], abs=0.02)
 
 

@@ -1,14 +1,15 @@
 """Tests the lambda locally, without the runtime. `pip install ./guest-sdk-python pytest`, then
 `pytest examples/imu-fft`.
 
-Drives that cannot be distributed with the project are expected in `../shared/data`, beside the
-checkout; tests that need a missing one are skipped."""
+Drives that cannot be distributed with the project are in the folder that `GLEANER_SHARED` names;
+tests that need a missing one are skipped."""
 
 from __future__ import annotations
 
 import csv
 import importlib.util
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +20,11 @@ from gleaner.testing import Run, Trigger, replay
 EXAMPLES = Path(__file__).resolve().parents[2]
 PYTHON = EXAMPLES / "imu-fft" / "python"
 SAMPLE = EXAMPLES / "data" / "highway_drive.mcap"
-SHARED = EXAMPLES.parents[1] / "shared" / "data"
+
+sys.path.append(str(EXAMPLES))
+from shared_data import shared  # noqa: E402
 
 ALL = {"rough": 0.0}
-
-
-def shared(name: str) -> Path:
-    path = SHARED / name
-    if not path.exists():
-        pytest.skip(f"{name} is not distributed with the project; put it into ../shared/data")
-    return path
 
 
 def shaken(signal: Any, rate_hz: float = 50.0, keep: Any = None, **config: Any) -> Run:

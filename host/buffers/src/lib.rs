@@ -46,7 +46,7 @@
 //! only if a sample was published in the meantime. In shared memory the writer never waits either;
 //! the readers of one process take turns for the few instructions that set a hazard.
 //!
-//! The atomics are loom's under `--cfg loom` (`tests/loom.rs`), and std's otherwise.
+//! The atomics are loom's under `--cfg loom` (`tests/loom`), and std's otherwise.
 
 mod error;
 mod free;

@@ -168,23 +168,28 @@ impl LiveRun<'_> {
         };
         let ended = event_loop.run(stop);
         let faults = event_loop.watch.faults();
-        event_loop.schedule.finish();
-        let unsent = event_loop.unsent();
-        event_loop.note_engine();
-        let LiveEventLoop { results, watch, inputs, schedule, session, recorder, feed, .. } =
-            event_loop;
-        let dropped = recorder.map(RecorderSender::leave);
-        let last = watch.ended(&Around {
-            feed: &feed,
-            inputs: &inputs,
-            schedule: &schedule,
-            session: &session,
-            unwritten: results.unwritten(),
-            unsent,
-            recorder_link: dropped,
-        });
-        results.finish(Some(last))?;
+        finish(event_loop)?;
         ended?;
         Ok(if faults > 0 { Exit::LambdaFaulted } else { Exit::Ok })
     }
+}
+
+/// Leaves the recorder, and sends the last results and the summary.
+fn finish(mut event_loop: LiveEventLoop) -> Result<(), Failure> {
+    event_loop.schedule.finish();
+    let unsent = event_loop.unsent();
+    event_loop.note_engine();
+    let LiveEventLoop { results, watch, inputs, schedule, session, recorder, feed, .. } =
+        event_loop;
+    let dropped = recorder.map(RecorderSender::leave);
+    let last = watch.ended(&Around {
+        feed: &feed,
+        inputs: &inputs,
+        schedule: &schedule,
+        session: &session,
+        unwritten: results.unwritten(),
+        unsent,
+        recorder_link: dropped,
+    });
+    results.finish(Some(last))
 }

@@ -7,10 +7,10 @@ use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Explain, Failure};
 use gleaner_drives::{Progress, Replay, ReplayStep};
-use gleaner_journal::{JournalEnd, TimeRange};
+use gleaner_journal::{JournalEnd, JournalHeader, TimeRange};
 use gleaner_lambda::FaultKind;
 use gleaner_lambda::manifest::Manifest;
-use gleaner_protocol::{ReplaySummary, Report, Round, TopicReport, WokenBy};
+use gleaner_protocol::{RecordingCounts, ReplaySummary, Report, Round, TopicReport, WokenBy};
 use gleaner_vitals::usage;
 
 use super::digests::Digests;
@@ -27,7 +27,7 @@ use crate::api::log::LogLine;
 use crate::api::trace::offered;
 use crate::guest::Totals;
 use crate::invoker::Invoker;
-use crate::journal::{EntryBuilder, LambdaIdentity};
+use crate::journal::{EntryBuilder, IdentityError, LambdaIdentity};
 use crate::schedule::WakeSchedule;
 use crate::session_setup::{
     ConfiguredLambda, Load, Output, OutputError, RunMode, SessionSetup, not_started,
@@ -50,6 +50,8 @@ struct ReplayLoop<'a> {
     recording: Option<ReplayRecorder>,
     signals: SignalCollector,
     part: TimeRange,
+    /// Number of clips of an earlier replay that were removed.
+    clips_replaced: u64,
     wakes: u64,
     triggers: u64,
     faults: u64,
@@ -133,8 +135,11 @@ impl ReplayLoop<'_> {
         Ok(self.journal.as_mut().map_or(Ok(()), JournalFile::flush)?)
     }
 
-    /// Ends the lambda's own process after its last wake, if it has one.
+    /// Ends the lambda's own process after its last wake, if it has one that has not ended early.
     fn finish(&mut self, at_ns: i64, manifest: &Manifest) -> Result<Option<Totals>, Failure> {
+        if self.stopped.is_some() {
+            return Ok(None);
+        }
         match self.invoker.finish() {
             Ok(totals) => Ok(totals),
             Err(fault) => {
@@ -147,10 +152,7 @@ impl ReplayLoop<'_> {
     }
 
     /// Runs the lambda over the drive, and closes open clips.
-    fn run(
-        &mut self,
-        drive: &mut Replay,
-    ) -> Result<(LoopEnd, gleaner_protocol::RecordingCounts), Failure> {
+    fn run(&mut self, drive: &mut Replay) -> Result<(LoopEnd, RecordingCounts), Failure> {
         let span = DriveSpan::of(drive, self.part);
         let reached = drive_loop::run(drive, span, self)?;
         // The end of a damaged drive is unknown: its last sample counts.
@@ -162,6 +164,75 @@ impl ReplayLoop<'_> {
             .map_or(Ok(Default::default()), |recording| recording.finish(end_ns))?;
         Ok((reached, recorded))
     }
+
+    /// Ends the journal, if there is one, with the checksums of the drives.
+    fn finish_journal(&mut self, digests: Option<Digests>, is_whole: bool) -> Result<(), Failure> {
+        let (Some(journal), Some(digests)) = (self.journal.take(), digests) else { return Ok(()) };
+        let samples = self.session.inputs().iter().map(|topic| offered(topic)).collect();
+        let end = JournalEnd { wakes: self.wakes, samples, drives: digests.take()? };
+        // A journal of a damaged drive, or of a lambda that was killed, gets no end, which would
+        // claim to be complete.
+        Ok(journal.finish((is_whole && self.stopped.is_none()).then_some(&end))?)
+    }
+
+    fn summary(
+        &self,
+        options: &ReplayOptions,
+        out: &Path,
+        manifest: &Manifest,
+        end: ReplayEnd<'_>,
+    ) -> ReplaySummary {
+        let ReplayEnd { drive, at_ns, broken, recorded, totals, wall_s } = end;
+        let start_ns = drive.start_ns().unwrap_or(0);
+        ReplaySummary {
+            lambda: manifest.lambda.name.to_string(),
+            version: manifest.lambda.version.to_string(),
+            kind: manifest.lambda.kind,
+            drive: options.drives.named.iter().map(|drive| lossy_path(drive)).collect(),
+            out: lossy_path(out),
+            wakes: self.wakes,
+            triggers: self.triggers,
+            faults: self.faults,
+            skipped: totals
+                .counts
+                .iter()
+                .fold(0, |sum: u64, counts| sum.saturating_add(counts.skipped)),
+            missed_ticks: self.schedule.missed(),
+            out_of_order: drive.out_of_order(),
+            log_lines: self.log_lines,
+            log_dropped: self.session.log_dropped(),
+            triggers_refused: self.session.triggers_refused(),
+            backed_off: self.session.backed_off(),
+            start_ns,
+            end_ns: drive.end_ns().unwrap_or(at_ns.max(start_ns)),
+            part: self.part,
+            wall_s,
+            run_s: self.invoker.run().as_secs_f64(),
+            decode_s: totals.decode_ns as f64 / 1e9,
+            wakes_per_s: if wall_s > 0.0 { self.wakes as f64 / wall_s } else { 0.0 },
+            peak_rss_bytes: self.invoker.peak_resident_bytes(),
+            topics: self.session.inputs().iter().zip(&totals.counts).map(topic_report).collect(),
+            recording: recorded,
+            clips_replaced: self.clips_replaced,
+            damaged: broken.map(|error| {
+                let mut failure = Failure::because("the drive could not be read to its end", error);
+                failure.causes.push(read_so_far(drive, at_ns));
+                failure.to_string()
+            }),
+            stopped: self.stopped.clone(),
+        }
+    }
+}
+
+/// The end of a replay, for its summary.
+struct ReplayEnd<'a> {
+    drive: &'a Replay,
+    /// Stamp of the last sample; 0 if there was none.
+    at_ns: i64,
+    broken: Option<&'a DriveError>,
+    recorded: RecordingCounts,
+    totals: &'a Totals,
+    wall_s: f64,
 }
 
 /// Outcome of a replay.
@@ -190,22 +261,10 @@ pub(super) fn replay(
     };
     let SessionSetup { inputs, session, mut guest } =
         SessionSetup::load(&mut drive, &options.lambda, manifest, RunMode::Replay, load)?;
-    let mut header = None;
-    if results.journal.is_some() || recording.is_some() {
-        let ConfiguredLambda { build, config, remaps, .. } = &options.lambda;
-        header = Some(
-            LambdaIdentity {
-                manifest,
-                build,
-                config,
-                remaps,
-                engine: guest.engine(),
-                clock: CLOCK,
-                part,
-            }
-            .header()?,
-        );
-    }
+    let has_header = results.journal.is_some() || recording.is_some();
+    let header = has_header
+        .then(|| journal_header(&options.lambda, manifest, guest.engine(), part))
+        .transpose()?;
     // Its preroll is allocated before `init`, from which on memory counts as the lambda's.
     if let (Some(recording), Some(header)) = (&mut recording, &header) {
         recording.start(&results.out, header)?;
@@ -239,6 +298,7 @@ pub(super) fn replay(
         recording,
         signals,
         part,
+        clips_replaced,
         wakes: 0,
         triggers: 0,
         faults: 0,
@@ -256,57 +316,18 @@ pub(super) fn replay(
     let (reached, recorded) = ran?;
     flushed?;
     let broken = reached.broken.map(DriveError);
-    let totals = if replay_loop.stopped.is_none() {
-        replay_loop.finish(reached.at_ns, manifest)?
-    } else {
-        None
-    };
-    if let (Some(journal), Some(digests)) = (replay_loop.journal.take(), digests) {
-        let samples = inputs.iter().map(|topic| offered(topic)).collect();
-        // A journal of a damaged drive, or of a lambda that was killed, gets no end, which would
-        // claim to be complete.
-        let end = JournalEnd { wakes: replay_loop.wakes, samples, drives: digests.take()? };
-        journal.finish((broken.is_none() && replay_loop.stopped.is_none()).then_some(&end))?;
-    }
+    let totals = replay_loop.finish(reached.at_ns, manifest)?;
+    replay_loop.finish_journal(digests, broken.is_none())?;
     let totals = totals.unwrap_or_else(|| Totals::of(&inputs, replay_loop.signals.curves()));
-    let wall_s = started.elapsed().as_secs_f64();
-    let summary = ReplaySummary {
-        lambda: name.to_owned(),
-        version: manifest.lambda.version.to_string(),
-        kind: manifest.lambda.kind,
-        drive: options.drives.named.iter().map(|drive| lossy_path(drive)).collect(),
-        out: lossy_path(&results.out),
-        wakes: replay_loop.wakes,
-        triggers: replay_loop.triggers,
-        faults: replay_loop.faults,
-        skipped: totals
-            .counts
-            .iter()
-            .fold(0, |sum: u64, counts| sum.saturating_add(counts.skipped)),
-        missed_ticks: replay_loop.schedule.missed(),
-        out_of_order: drive.out_of_order(),
-        log_lines: replay_loop.log_lines,
-        log_dropped: replay_loop.session.log_dropped(),
-        triggers_refused: replay_loop.session.triggers_refused(),
-        backed_off: replay_loop.session.backed_off(),
-        start_ns: drive.start_ns().unwrap_or(0),
-        end_ns: drive.end_ns().unwrap_or(reached.at_ns.max(drive.start_ns().unwrap_or(0))),
-        part,
-        wall_s,
-        run_s: replay_loop.invoker.run().as_secs_f64(),
-        decode_s: totals.decode_ns as f64 / 1e9,
-        wakes_per_s: if wall_s > 0.0 { replay_loop.wakes as f64 / wall_s } else { 0.0 },
-        peak_rss_bytes: replay_loop.invoker.peak_resident_bytes(),
-        topics: inputs.iter().zip(&totals.counts).map(topic_report).collect(),
-        recording: recorded,
-        clips_replaced,
-        damaged: broken.as_ref().map(|error| {
-            let mut failure = Failure::because("the drive could not be read to its end", error);
-            failure.causes.push(read_so_far(&drive, reached.at_ns));
-            failure.to_string()
-        }),
-        stopped: replay_loop.stopped.clone(),
+    let end = ReplayEnd {
+        drive: &drive,
+        at_ns: reached.at_ns,
+        broken: broken.as_ref(),
+        recorded,
+        totals: &totals,
+        wall_s: started.elapsed().as_secs_f64(),
     };
+    let summary = replay_loop.summary(options, &results.out, manifest, end);
     // Only the HTML report needs these. The other results are complete without them.
     let incomplete = replay_loop
         .signals
@@ -314,6 +335,17 @@ pub(super) fn replay(
         .err();
     output.finish(&summary)?;
     Ok(ReplayOutcome { summary, broken: broken.map(|error| error.exit()), incomplete })
+}
+
+/// Describes the lambda, for the journal and for clips.
+fn journal_header(
+    lambda: &ConfiguredLambda,
+    manifest: &Manifest,
+    engine: String,
+    part: TimeRange,
+) -> Result<JournalHeader, IdentityError> {
+    let ConfiguredLambda { build, config, remaps, .. } = lambda;
+    LambdaIdentity { manifest, build, config, remaps, engine, clock: CLOCK, part }.header()
 }
 
 /// Describes the part of a damaged drive that was read.

@@ -114,17 +114,31 @@ pub struct RecordedRun {
     loopback: Loopback,
     clock: Clock,
     stop: Arc<AtomicBool>,
-    reports: BufReader<PipeReader>,
-    recorder_reports: BufReader<PipeReader>,
     control: ControlClient,
-    run: JoinHandle<Result<Exit, Failure>>,
-    recorder: JoinHandle<Result<(), Failure>>,
+    run: ProgramThread<Exit>,
+    recorder: ProgramThread<()>,
     ingress: IngressControl,
     ingress_thread: Option<JoinHandle<()>>,
-    /// To the recorder, and to the lambda.
-    handovers: [UnixStream; 2],
     sent: [u64; 2],
     wakes: Arc<AtomicU64>,
+}
+
+/// The thread of a program, with its reports and the socket of its starter.
+struct ProgramThread<T> {
+    thread: JoinHandle<Result<T, Failure>>,
+    reports: BufReader<PipeReader>,
+    handover: UnixStream,
+}
+
+impl<T: Send + 'static> ProgramThread<T> {
+    /// Starts `program`, which gets the pipe for its reports and a socket to its starter.
+    fn start(program: impl FnOnce(File, OwnedFd) -> Result<T, Failure> + Send + 'static) -> Self {
+        let (reports, to_reports) = pipe().unwrap();
+        let (handover, starter) = UnixStream::pair().unwrap();
+        let to_reports = File::from(OwnedFd::from(to_reports));
+        let thread = thread::spawn(move || program(to_reports, starter.into()));
+        Self { thread, reports: BufReader::new(reports), handover }
+    }
 }
 
 impl RecordedRun {
@@ -137,44 +151,26 @@ impl RecordedRun {
     /// the lambda are attached, and `early` numbers are received before it is started.
     pub fn start_after(earlier: i64, early: i64) -> Self {
         let folder = TempDir::new().unwrap();
-        let lambda = folder.path().join("adder");
-        fs::create_dir_all(lambda.join("build")).unwrap();
-        fs::write(lambda.join("build/lambda.toml"), MANIFEST).unwrap();
-        fs::write(lambda.join("build/adder.wasm"), "x").unwrap();
+        let lambda = build(folder.path());
         let (loopback, clock, stop) =
             (Loopback::new(), Clock::from_time_of_day(), Arc::<AtomicBool>::default());
         add_topics(&loopback);
         let (mut control, stdin) = ControlClient::pair().unwrap();
-        let (recorder_reports, to_reports) = pipe().unwrap();
-        let options = RecorderOptions {
-            out: folder.path().join("out"),
-            clock,
-            messages: Sources::default(),
-            preroll_bytes: None,
-            disk_floor: 0,
-            clips_max: None,
-            bytes_max: None,
-            commands: None,
-        };
         let (reports, reported) = sync_channel(64);
         let send = move |report| drop(reports.try_send(report));
         let source = Box::new(loopback.clone());
         let (mut ingress, ingress_thread) = Ingress::start_with_reports(source, send).unwrap();
-        let reader = AddReader {
-            name: "recorder".to_owned(),
-            topics: vec![grant(TOPICS[0])],
-            publishes: Vec::new(),
-        };
+        let reader = recorder(vec![grant(TOPICS[0])]);
         let (socket, stopped) = (ingress.add_reader(&reader).unwrap(), Arc::clone(&stop));
-        let (recorder_handover, handover) = UnixStream::pair().unwrap();
-        let recorder = thread::spawn(move || {
+        let options = recorder_options(folder.path().join("out"), clock);
+        let recorder = ProgramThread::start(move |reports, starter| {
             let connections = RecorderConnections {
                 control: stdin,
                 ingress: socket,
-                starter: Some(handover.into()),
+                starter: Some(starter),
                 signer: None,
             };
-            record(options, connections, File::from(OwnedFd::from(to_reports)), stopped)
+            record(options, connections, reports, stopped)
         });
         let add = AddLambda {
             lambda: lambda.clone(),
@@ -183,10 +179,8 @@ impl RecordedRun {
             grants: TOPICS.map(|(topic, id)| (topic.to_owned(), id)).to_vec(),
         };
         let near = control.add(&add).unwrap();
-        let (reports, to_reports) = pipe().unwrap();
         let manifest = Manifest::parse(MANIFEST, "lambda.toml").unwrap();
         let reader = adder(&manifest);
-        let (handover, starter) = UnixStream::pair().unwrap();
         let mut sent = [0; 2];
         if earlier > 0 {
             wait_for_readers(&reported, 1, &TOPICS[..1]);
@@ -201,49 +195,37 @@ impl RecordedRun {
         }
         let wakes = Arc::<AtomicU64>::default();
         let counted = Arc::clone(&wakes);
-        let run = thread::spawn(move || {
+        let run = ProgramThread::start(move |reports, starter| {
             let pulse = Pulse::create().unwrap().0;
             let nowhere = File::options().write(true).open("/dev/null").unwrap();
             let run = LiveRun {
                 lambda: configured(&lambda),
                 manifest,
-                settings: Settings {
-                    out: lambda,
-                    all: false,
-                    restarts: 0,
-                    clock,
-                    round_trip: None,
-                    announce: None,
-                },
+                settings: live_settings(lambda, clock),
                 feed: Feed::connect(socket).unwrap(),
-                starter: Some(starter.into()),
+                starter: Some(starter),
                 recorder: Some(near),
                 results: ResultsPipe::over(nowhere, pulse.clone()),
                 pulse,
                 close: &mut || Ok(Vec::new()),
                 stop: &stopped,
             };
-            run.run(&mut load(counted), File::from(OwnedFd::from(to_reports)))
+            run.run(&mut load(counted), reports)
         });
-        let (reports, recorder_reports) =
-            (BufReader::new(reports), BufReader::new(recorder_reports));
         let mut running = Self {
             folder,
             loopback,
             clock,
             stop,
-            reports,
-            recorder_reports,
             control,
             run,
             recorder,
             ingress,
             ingress_thread: Some(ingress_thread),
-            handovers: [recorder_handover, handover],
             sent,
             wakes,
         };
-        until(&mut running.reports, |report| matches!(report, Report::Ready).then_some(()));
+        until(&mut running.run.reports, |report| matches!(report, Report::Ready).then_some(()));
         running.recorder_has("/numbers");
         running
     }
@@ -264,12 +246,12 @@ impl RecordedRun {
         let (control, thread) = Ingress::start_with_reports(source, send).unwrap();
         (self.ingress, self.ingress_thread) = (control, Some(thread));
         let manifest = Manifest::parse(MANIFEST, "lambda.toml").unwrap();
-        let (name, publishes) = ("recorder".to_owned(), Vec::new());
-        let recorder = AddReader { name, topics: TOPICS.map(grant).to_vec(), publishes };
+        let recorder = recorder(TOPICS.map(grant).to_vec());
         for (mut reader, index) in [recorder, adder(&manifest)].into_iter().zip(0..) {
             reader.topics = reader.topics.into_iter().map(|topic| topic.again(true)).collect();
             let ingress = Some(self.ingress.add_reader(&reader).unwrap());
-            Handover { ingress, ..Handover::default() }.try_send(&self.handovers[index]).unwrap();
+            let handover = [&self.recorder.handover, &self.run.handover][index];
+            Handover { ingress, ..Handover::default() }.try_send(handover).unwrap();
             wait_for_readers(&reported, index + 1, &TOPICS);
             if index == 0 {
                 (1..=first).for_each(|value| self.publish("/others", value, 8));
@@ -286,7 +268,7 @@ impl RecordedRun {
     }
 
     fn recorder_has(&mut self, topic: &str) {
-        until(&mut self.recorder_reports, |report| {
+        until(&mut self.recorder.reports, |report| {
             let RecorderReport::Status(status) = report else { return None };
             let is_known =
                 |known: &RecordedTopic| known.topic == topic && known.type_name.is_some();
@@ -330,7 +312,7 @@ impl RecordedRun {
     }
 
     pub fn next_clip(&mut self) -> Clip {
-        until(&mut self.recorder_reports, |report| match report {
+        until(&mut self.recorder.reports, |report| match report {
             RecorderReport::Clip(clip) => Some(*clip),
             _ => None,
         })
@@ -359,9 +341,35 @@ impl RecordedRun {
     pub fn end(self) {
         self.stop.store(true, Ordering::Relaxed);
         drop(self.control);
-        self.run.join().unwrap().unwrap();
-        self.recorder.join().unwrap().unwrap();
+        self.run.thread.join().unwrap().unwrap();
+        self.recorder.thread.join().unwrap().unwrap();
     }
+}
+
+/// Writes the build of the lambda into `folder`; returns the lambda's folder.
+fn build(folder: &Path) -> PathBuf {
+    let lambda = folder.join("adder");
+    fs::create_dir_all(lambda.join("build")).unwrap();
+    fs::write(lambda.join("build/lambda.toml"), MANIFEST).unwrap();
+    fs::write(lambda.join("build/adder.wasm"), "x").unwrap();
+    lambda
+}
+
+fn recorder_options(out: PathBuf, clock: Clock) -> RecorderOptions {
+    RecorderOptions {
+        out,
+        clock,
+        messages: Sources::default(),
+        preroll_bytes: None,
+        disk_floor: 0,
+        clips_max: None,
+        bytes_max: None,
+        commands: None,
+    }
+}
+
+fn live_settings(out: PathBuf, clock: Clock) -> Settings {
+    Settings { out, all: false, restarts: 0, clock, round_trip: None, announce: None }
 }
 
 /// Waits until each of `topics` has so many readers.
@@ -404,6 +412,11 @@ fn add_topics(loopback: &Loopback) {
     for (topic, _) in TOPICS {
         loopback.add_topic(topic, "test_msgs/msg/Number", "int64 value\n");
     }
+}
+
+/// The recorder as a reader.
+fn recorder(topics: Vec<TopicGrant>) -> AddReader {
+    AddReader { name: "recorder".to_owned(), topics, publishes: Vec::new() }
 }
 
 /// The lambda as a reader.

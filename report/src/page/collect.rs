@@ -52,38 +52,8 @@ pub(crate) fn collect(
     };
     let start_ns = from_ns.unwrap_or(begin_ns);
 
-    let budget = TEXT_BYTES / shares;
-    let mut events = Events::new(start_ns, budget);
-    let mut last_ns = begin_ns;
-    each(out, "decisions.jsonl", true, &mut notes, |decision: Decision| {
-        last_ns = last_ns.max(decision.at_ns);
-        events.add(&decision);
-    })?;
-
-    let (mut log, mut log_seen, mut log_budget) = (Vec::new(), 0, TextBudget(budget / 2));
-    each(out, "log.jsonl", true, &mut notes, |line: UntrustedLogLine| {
-        last_ns = last_ns.max(line.at_ns);
-        log_seen += 1;
-        let (t, level) = (seconds(line.at_ns, start_ns), cut(&line.level, 12));
-        let shown = PageLogLine { t, level, message: cut(&line.message, LOG_CHARS) };
-        if log.len() < LOG_MAX && log_budget.take(&shown) {
-            log.push(shown);
-        }
-    })?;
-
-    let (mut clips, mut clips_seen, mut clip_budget) = (Vec::new(), 0, TextBudget(budget / 2));
-    let mut thumbnails = Vec::new();
-    // A run without [record] has no clips.
-    each(out, "clips.jsonl", false, &mut notes, |clip: Clip| {
-        last_ns = last_ns.max(clip_span(&clip)[1]);
-        clips_seen += 1;
-        let shown = clip_shown(&clip, start_ns);
-        if clips.len() < CLIPS_MAX && clip_budget.take(&shown) {
-            thumbnails.push(clip.thumbnail);
-            clips.push(shown);
-        }
-    })?;
-
+    let RunItems { mut events, log, log_seen, clips, clips_seen, thumbnails, last_ns } =
+        RunItems::read(out, start_ns, TEXT_BYTES / shares, &mut notes)?;
     let mut pictures = Pictures::new(out, start_ns, shares);
     pictures.at_triggers(
         &mut events.triggers,
@@ -106,7 +76,7 @@ pub(crate) fn collect(
         start_ns,
         start_ms: start_ns as f64 / 1e6,
         from: seconds(begin_ns, start_ns),
-        to: seconds(last_ns, start_ns),
+        to: seconds(last_ns.max(begin_ns), start_ns),
         is_part: false,
         config,
         counts: summary.wakes().into_iter().collect(),
@@ -152,6 +122,62 @@ pub(crate) fn collect(
     };
     set_drive(&mut run, &summary);
     Ok(run)
+}
+
+/// Decisions, log lines and clips of a run, within the budgets of the page.
+struct RunItems {
+    events: Events,
+    log: Vec<PageLogLine>,
+    log_seen: u64,
+    clips: Vec<PageClip>,
+    clips_seen: u64,
+    /// One entry for each of `clips`.
+    thumbnails: Vec<Option<PathBuf>>,
+    /// End of the last item; [`i64::MIN`] if there is none.
+    last_ns: i64,
+}
+
+impl RunItems {
+    /// Reads the items of the run in `out`. Times count from `start_ns`; texts of triggers may take
+    /// `budget` bytes.
+    fn read(
+        out: &Path,
+        start_ns: i64,
+        budget: usize,
+        notes: &mut Vec<String>,
+    ) -> Result<Self, ResultsError> {
+        let mut events = Events::new(start_ns, budget);
+        let mut last_ns = i64::MIN;
+        each(out, "decisions.jsonl", true, notes, |decision: Decision| {
+            last_ns = last_ns.max(decision.at_ns);
+            events.add(&decision);
+        })?;
+
+        let (mut log, mut log_seen, mut log_budget) = (Vec::new(), 0, TextBudget(budget / 2));
+        each(out, "log.jsonl", true, notes, |line: UntrustedLogLine| {
+            last_ns = last_ns.max(line.at_ns);
+            log_seen += 1;
+            let (t, level) = (seconds(line.at_ns, start_ns), cut(&line.level, 12));
+            let shown = PageLogLine { t, level, message: cut(&line.message, LOG_CHARS) };
+            if log.len() < LOG_MAX && log_budget.take(&shown) {
+                log.push(shown);
+            }
+        })?;
+
+        let (mut clips, mut clips_seen, mut clip_budget) = (Vec::new(), 0, TextBudget(budget / 2));
+        let mut thumbnails = Vec::new();
+        // A run without [record] has no clips.
+        each(out, "clips.jsonl", false, notes, |clip: Clip| {
+            last_ns = last_ns.max(clip_span(&clip)[1]);
+            clips_seen += 1;
+            let shown = clip_shown(&clip, start_ns);
+            if clips.len() < CLIPS_MAX && clip_budget.take(&shown) {
+                thumbnails.push(clip.thumbnail);
+                clips.push(shown);
+            }
+        })?;
+        Ok(Self { events, log, log_seen, clips, clips_seen, thumbnails, last_ns })
+    }
 }
 
 /// Sets the drive and the part of it that was replayed.

@@ -182,22 +182,7 @@ fn starts_and_stops() -> Result<(), Failed> {
     looks.push(cpu(&writers, &readers));
     let starts = times("GLEANER_STARTS", 2);
     for _ in 0..starts {
-        let out = TempFolder::new();
-        let run = run_all(&folders, out.path(), &["--no-record"]);
-        let mut receiving = BTreeSet::new();
-        run.until_named("samples in all lambdas", |name, report| {
-            if let Report::Live(live) = report
-                && live.topics[0].received > 0
-            {
-                receiving.insert(name);
-            }
-            (receiving.len() == LAMBDAS).then_some(())
-        });
-        run.signal("INT");
-        let finished = run.finish();
-        if !finished.status.success() {
-            return Err(format!("{}: {}", finished.status, finished.stderr).into());
-        }
+        run_until_samples(&folders)?;
     }
     looks.push(cpu(&writers, &readers));
     for (writer, (kind, _)) in writers.iter_mut().zip(topics) {
@@ -228,6 +213,27 @@ fn starts_and_stops() -> Result<(), Failed> {
     }
     println!("{starts} starts of {LAMBDAS} lambdas");
     Ok(())
+}
+
+/// Starts a run of the lambdas, and stops it when each has received samples.
+fn run_until_samples(lambdas: &[&Path]) -> Result<(), Failed> {
+    let out = TempFolder::new();
+    let run = run_all(lambdas, out.path(), &["--no-record"]);
+    let mut receiving = BTreeSet::new();
+    run.until_named("samples in all lambdas", |name, report| {
+        if let Report::Live(live) = report
+            && live.topics[0].received > 0
+        {
+            receiving.insert(name);
+        }
+        (receiving.len() == lambdas.len()).then_some(())
+    });
+    run.signal("INT");
+    let finished = run.finish();
+    match finished.status.success() {
+        true => Ok(()),
+        false => Err(format!("{}: {}", finished.status, finished.stderr).into()),
+    }
 }
 
 /// Checks the announcement of the only participant in this network, which lives as long as the

@@ -8,7 +8,7 @@ use std::process::Command;
 use gleaner_lambda::Clip;
 use gleaner_tests::drive::corrupted;
 use gleaner_tests::{
-    LambdaCopy, ReplayRun, TempFolder, replay_to, root, sample_drive, shared_drive,
+    LambdaCopy, ReplayRun, TempFolder, replay_to, root, sample_drive, shared_file,
 };
 use libtest_mimic::{Failed, Trial};
 
@@ -58,7 +58,7 @@ pub fn trials() -> Vec<Trial> {
     );
     read(
         "mcap_rosbags_and_mcap_ros2_read_the_clips_of_rec_brake_dark",
-        shared_drive("rec_brake_dark.mcap"),
+        shared_file("rec_brake_dark.mcap"),
         &["--set", "event_s=5,9,35"],
     );
     trials

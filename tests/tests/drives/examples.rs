@@ -1,13 +1,13 @@
 //! Runs the examples and test lambdas over recorded drives: decisions as expected, and twins that
 //! agree.
 //!
-//! Drives that cannot be part of the project are in `../shared/data`; tests without their drive are
-//! ignored with that reason.
+//! Drives that cannot be part of the project are in the folder that `GLEANER_SHARED` names; tests
+//! without their drive are ignored with that reason.
 
 use std::path::{Path, PathBuf};
 
 use gleaner_lambda::twins_differ;
-use gleaner_tests::{ReplayRun, replay, root, sample_drive, shared_drive};
+use gleaner_tests::{ReplayRun, replay, root, sample_drive, shared_file};
 use libtest_mimic::{Failed, Trial};
 
 const KINDS: [&str; 2] = ["rust", "python"];
@@ -78,14 +78,14 @@ pub fn trials() -> Vec<Trial> {
     trials
 }
 
-/// A test on a drive beside the checkout; ignored, with the reason in its name, if the drive is
-/// missing.
+/// A test on a file that is not part of the project; ignored, with the reason in its name, if the
+/// file is missing.
 fn shared(
     name: String,
-    drive: &str,
+    file: &str,
     test: impl FnOnce(PathBuf) -> Result<(), Failed> + Send + 'static,
 ) -> Trial {
-    match shared_drive(drive) {
+    match shared_file(file) {
         Ok(path) => Trial::test(name, move || test(path)),
         Err(reason) => Trial::test(format!("{name} [{reason}]"), || Ok(())).with_ignored_flag(true),
     }

@@ -91,6 +91,19 @@ fn records(parts: &ClipParts) -> Vec<Forgery> {
     forgeries
 }
 
+/// The line of the clip, as `clips.jsonl` has it.
+fn line_of(parts: &mut ClipParts) -> Clip {
+    serde_json::from_str(&parts.record("clip")["line"]).unwrap()
+}
+
+/// Changes the attributes of the decision and of the line.
+fn change_attributes(parts: &mut ClipParts) {
+    let attributes = r#"{"pedestrian":true}"#;
+    parts.record("decision").insert("attributes".to_owned(), attributes.to_owned());
+    parts
+        .change_line(|line| line.moments[0].attributes = serde_json::from_str(attributes).unwrap());
+}
+
 /// Changes that are consistent in more than one place of the clip.
 fn statements() -> Vec<Forgery> {
     vec![
@@ -99,23 +112,10 @@ fn statements() -> Vec<Forgery> {
                 .record("decision")
                 .insert("attributes".to_owned(), r#"{"pedestrian":true}"#.to_owned());
         }),
-        forgery("attributes of a decision and of the line", &["gleaner.begin"], |parts| {
-            let attributes = r#"{"pedestrian":true}"#;
-            parts.record("decision").insert("attributes".to_owned(), attributes.to_owned());
-            parts.change_line(|line| {
-                line.moments[0].attributes = serde_json::from_str(attributes).unwrap()
-            });
-        }),
+        forgery("attributes of a decision and of the line", &["gleaner.begin"], change_attributes),
         forgery("attributes everywhere", &["gleaner.decision"], |parts| {
-            let attributes = r#"{"pedestrian":true}"#;
-            parts.record("decision").insert("attributes".to_owned(), attributes.to_owned());
-            parts.change_line(|line| {
-                line.moments[0].attributes = serde_json::from_str(attributes).unwrap()
-            });
-            let moment = serde_json::from_str::<Clip>(&parts.record("clip")["line"])
-                .unwrap()
-                .moments
-                .remove(0);
+            change_attributes(parts);
+            let moment = line_of(parts).moments.remove(0);
             parts
                 .record("begin")
                 .insert("moment".to_owned(), serde_json::to_string(&moment).unwrap());
@@ -128,10 +128,7 @@ fn statements() -> Vec<Forgery> {
                 line.moments.clear();
                 line.incomplete.push("continues the clip before".to_owned());
             });
-            let short = serde_json::from_str::<Clip>(&parts.record("clip")["line"])
-                .unwrap()
-                .incomplete
-                .join("; ");
+            let short = line_of(parts).incomplete.join("; ");
             parts.record("clip").insert("incomplete".to_owned(), short);
         }),
         forgery("one additional trigger, counted only", &["gleaner.clip", "triggers"], |parts| {
@@ -151,9 +148,7 @@ fn statements() -> Vec<Forgery> {
             "from_ns after the first message, three times",
             &["gleaner.clip", "from_ns"],
             |parts| {
-                let later =
-                    serde_json::from_str::<Clip>(&parts.record("clip")["line"]).unwrap().moments[0]
-                        .at_ns;
+                let later = line_of(parts).moments[0].at_ns;
                 parts.change_line(|line| line.from_ns = later);
                 parts.record("clip").insert("from_ns".to_owned(), later.to_string());
                 parts.record("begin").insert("from_ns".to_owned(), later.to_string());
@@ -256,6 +251,12 @@ fn messages() -> Vec<Forgery> {
         forgery("a byte of an IMU message", &["gleaner.topic", IMU, "checksum"], |parts| {
             *parts.messages_of(IMU)[20].2.last_mut().unwrap() ^= 1;
         }),
+    ]
+}
+
+/// Changed channels and definitions.
+fn channels() -> Vec<Forgery> {
+    vec![
         forgery(
             "another definition of the camera",
             &["gleaner.topic", CAMERA, "definitions"],
@@ -359,7 +360,7 @@ fn all_forgeries_are_refused(kind: &str) {
         original.messages_of(CAMERA).len() > 10
             && original.metadata.iter().any(|of| of.name == "gleaner.decision")
     );
-    let all = [records(&original), statements(), messages(), attachments(other)];
+    let all = [records(&original), statements(), messages(), channels(), attachments(other)];
     let forgeries: Vec<Forgery> = all.into_iter().flatten().collect();
     assert!(forgeries.len() > 150, "{}", forgeries.len());
     let mut accepted = Vec::new();

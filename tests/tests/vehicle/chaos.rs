@@ -72,27 +72,7 @@ pub fn killed_at_random() {
         listed.extend(clips(&vehicle).into_iter().map(|clip| clip.file));
         let before = restarts(&vehicle);
         let started = Instant::now();
-        match victim {
-            "gleaner-orchestrator" => {
-                vehicle.kill_orchestrator();
-                thread::sleep(Duration::from_millis(random.below(200) as u64));
-                vehicle.start();
-            }
-            "gleaner-supervisor" => {
-                let pid = vehicle.supervisor();
-                signal(pid, "KILL");
-                vehicle.until("another one", |vehicle| (vehicle.supervisor() != pid).then_some(()));
-            }
-            name => {
-                let pids = vehicle.until("a victim", |vehicle| {
-                    Some(vehicle.processes(name)).filter(|pids| !pids.is_empty())
-                });
-                signal(pids[random.below(pids.len())], "KILL");
-                vehicle.until("another one", |vehicle| {
-                    vehicle.processes(name).iter().any(|pid| !pids.contains(pid)).then_some(())
-                });
-            }
-        }
+        kill(&mut vehicle, victim, &mut random);
         // The status may be that of a moment before.
         thread::sleep(Duration::from_millis(50));
         vehicle.until("all processes", |vehicle| runs(vehicle).then_some(()));
@@ -139,6 +119,31 @@ pub fn killed_at_random() {
     let status = vehicle.status();
     vehicle.stop();
     check_clips(&vehicle, &status, &listed);
+}
+
+/// Kills a process of `victim`, and waits until another one has taken its place.
+fn kill(vehicle: &mut TestVehicle, victim: &str, random: &mut XorShift64) {
+    match victim {
+        "gleaner-orchestrator" => {
+            vehicle.kill_orchestrator();
+            thread::sleep(Duration::from_millis(random.below(200) as u64));
+            vehicle.start();
+        }
+        "gleaner-supervisor" => {
+            let pid = vehicle.supervisor();
+            signal(pid, "KILL");
+            vehicle.until("another one", |vehicle| (vehicle.supervisor() != pid).then_some(()));
+        }
+        name => {
+            let pids = vehicle.until("a victim", |vehicle| {
+                Some(vehicle.processes(name)).filter(|pids| !pids.is_empty())
+            });
+            signal(pids[random.below(pids.len())], "KILL");
+            vehicle.until("another one", |vehicle| {
+                vehicle.processes(name).iter().any(|pid| !pids.contains(pid)).then_some(())
+            });
+        }
+    }
 }
 
 /// Returns the example with a model, on the images of the player.

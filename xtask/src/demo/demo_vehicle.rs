@@ -1,4 +1,5 @@
-//! The vehicle of the demo: its folders, keys and orchestrator, and commands to it and its cloud.
+//! The vehicle of the demo: its folders, keys and orchestrator, and commands to it and its cloud,
+//! if it has one.
 
 use std::fs::{self, File};
 use std::io;
@@ -40,14 +41,20 @@ pub(super) struct DemoVehicle<'c> {
     /// Folder of the sockets.
     run: PathBuf,
     orchestrator: Option<Child>,
+    /// True if it has a cloud, in which it is enrolled.
+    pub(super) has_cloud: bool,
     /// Set by SIGTERM: the demo is to end.
     ends: Arc<AtomicBool>,
 }
 
 impl<'c> DemoVehicle<'c> {
     /// Makes keys and a trust root, starts the orchestrator with its sockets in `run`, installs the
-    /// trust root, and enrols the vehicle at the cloud.
-    pub(super) fn start(checkout: &'c Checkout, run: &Path) -> Result<Self, Failure> {
+    /// trust root, and enrols the vehicle at the cloud, if it has one.
+    pub(super) fn start(
+        checkout: &'c Checkout,
+        run: &Path,
+        has_cloud: bool,
+    ) -> Result<Self, Failure> {
         let (out, ends) = (checkout.path(OUT), Arc::new(AtomicBool::new(false)));
         let prepared = remove(&out)
             .and_then(|()| fs::create_dir_all(&out))
@@ -57,7 +64,8 @@ impl<'c> DemoVehicle<'c> {
         let log = prepared.map_err(|error| {
             Failure::caused_by(Exit::Internal, format!("cannot prepare `{OUT}`"), &error)
         })?;
-        let mut vehicle = Self { checkout, run: run.to_owned(), orchestrator: None, ends };
+        let mut vehicle =
+            Self { checkout, run: run.to_owned(), orchestrator: None, has_cloud, ends };
         for key in ["root", "publisher", "deployer"] {
             vehicle.gleaner(&["keys", "new", &file(&format!("{key}.pem"))])?;
         }
@@ -76,9 +84,11 @@ impl<'c> DemoVehicle<'c> {
         vehicle.orchestrator = Some(started);
         vehicle.until("gleaner-orchestrator to answer", |_| Some(()))?;
         vehicle.gleaner(&["trust", "install", &trust])?;
-        let enrolment = file("enrolment.json");
-        vehicle.gleaner(&["vehicles", "enrol", NAME, "--to", &enrolment])?;
-        vehicle.gleaner(&["enrol", &enrolment])?;
+        if has_cloud {
+            let enrolment = file("enrolment.json");
+            vehicle.gleaner(&["vehicles", "enrol", NAME, "--to", &enrolment])?;
+            vehicle.gleaner(&["enrol", &enrolment])?;
+        }
         Ok(vehicle)
     }
 

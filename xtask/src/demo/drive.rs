@@ -2,23 +2,21 @@
 
 use std::collections::BTreeMap;
 
-use gleaner_base::{Exit, Failure, visible};
+use gleaner_base::{Failure, visible};
 use gleaner_lambda::Decision;
 use gleaner_report::format::{clip_contents, clip_span, grouped, seconds};
 
 use crate::checkout::Checkout;
-use crate::examples::{DRIVE, EXAMPLES, Example, TwinReplay, difference};
-use crate::steps::Steps;
+use crate::examples::{DRIVE, Example, TwinReplay, difference};
 
-/// Replays the sample drive with both twins of every example, compares them, and repeats every
-/// decision from the journal and from the clips alone.
-pub(super) fn run(checkout: &Checkout, steps: &mut Steps) -> Result<Exit, Failure> {
-    steps.begin(&format!("replay of {DRIVE}"));
+/// Replays the sample drive with both twins of the examples, compares them, and repeats every
+/// decision from the journal and from the clips alone. Returns whether the twins agree.
+pub(super) fn run(checkout: &Checkout, examples: &[&Example]) -> Result<bool, Failure> {
     let mut rows =
         vec![["example", "kind", "wakes", "wakes/s", "peak MiB", "triggers"].map(str::to_owned)];
     let (mut verdicts, mut verifications, mut clips) = (Vec::new(), Vec::new(), Vec::new());
     let mut agree = true;
-    for example in &EXAMPLES {
+    for example in examples {
         let twins = example.replay(checkout)?;
         rows.extend(twins.iter().map(|twin| row(example.name, twin)));
         for twin in &twins {
@@ -55,6 +53,11 @@ pub(super) fn run(checkout: &Checkout, steps: &mut Steps) -> Result<Exit, Failur
     for verification in verifications {
         println!("{verification}");
     }
+    Ok(agree)
+}
+
+/// Prints which files there are, and what to try next.
+pub(super) fn print_files(checkout: &Checkout) {
     println!(
         "\nfiles: out/demo/EXAMPLE-KIND/ with clips/, clips.jsonl, decisions.jsonl, log.jsonl, \
          summary.json, wakes.journal, and report.html"
@@ -65,7 +68,6 @@ pub(super) fn run(checkout: &Checkout, steps: &mut Steps) -> Result<Exit, Failur
         "try next, with another threshold: {gleaner} replay examples/hello/rust {DRIVE} \
          --set brake_mps2=-1.2"
     );
-    Ok(if agree { Exit::Ok } else { Exit::Differs })
 }
 
 /// Formats each clip: file, contents and thumbnail.

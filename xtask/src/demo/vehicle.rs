@@ -1,5 +1,5 @@
-//! The second part of the demo: starts the cloud, and `vehicle_run` in a private network, so that
-//! no DDS participant of another program sees it. A relay connects both.
+//! The second part of the demo: starts the cloud, if there is one, and `vehicle_run` in a private
+//! network, so that no DDS participant of another program sees it. A relay connects both.
 
 use std::fs::{self, DirBuilder};
 use std::io::{self, Read};
@@ -15,7 +15,7 @@ use rustix::process::{Pid, Signal, kill_process_group};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use super::demo_cloud::DemoCloud;
-use super::{relay, vehicle_run};
+use super::{DemoOptions, relay, vehicle_run};
 use crate::checkout::Checkout;
 use crate::player;
 use crate::steps::{self, Steps};
@@ -25,13 +25,13 @@ const SET_UP: &str = "ip link set lo up && ip link set lo multicast on && \
                       ip route add 224.0.0.0/4 dev lo && exec \"$0\" \"$@\"";
 
 /// Runs the part; skips it with a line if the player cannot be fetched, or no network be created.
-/// The page is left open until Ctrl-C if `stays_open`.
 pub(super) fn run(
     checkout: &Checkout,
     steps: &mut Steps,
-    stays_open: bool,
+    options: &DemoOptions,
 ) -> Result<Exit, Failure> {
-    steps.begin("the same lambdas on a vehicle, in a network of its own, by a cloud");
+    let by = if options.has_cloud { ", by a cloud" } else { "" };
+    steps.begin(&format!("the same lambdas on a vehicle, in a network of its own{by}"));
     if !checkout.program("gleaner-player").is_file() {
         match player::run(checkout) {
             Err(failure) if failure.exit == Exit::Unreachable => {
@@ -48,7 +48,7 @@ pub(super) fn run(
     let permitted = candidates
         .into_iter()
         .find(|options| steps::succeeds(shell(checkout, options).arg("true")));
-    let Some(options) = permitted else {
+    let Some(unshare) = permitted else {
         return Ok(skipped("`unshare -n` or `ip` is missing or not permitted here"));
     };
     let program = std::env::current_exe().map_err(|error| {
@@ -56,16 +56,19 @@ pub(super) fn run(
     })?;
     let failed =
         |error| Failure::caused_by(Exit::Internal, "cannot start a private network", &error);
-    let cloud = DemoCloud::start(checkout)?;
     let run = RunFolder::create().map_err(failed)?;
-    relay::out_of(&run.0.join("relay"), &cloud.ports).map_err(failed)?;
-    let mut vehicle = shell(checkout, options);
+    let mut vehicle = shell(checkout, unshare);
     vehicle.arg(program).arg(vehicle_run::COMMAND).arg(&run.0);
-    if stays_open {
-        vehicle.arg(&cloud.url);
+    let cloud = options.has_cloud.then(|| DemoCloud::start(checkout)).transpose()?;
+    if let Some(cloud) = &cloud {
+        relay::out_of(&run.0.join("relay"), &cloud.ports).map_err(failed)?;
+        vehicle.arg(vehicle_run::BY_CLOUD);
+        if options.stays_open {
+            vehicle.arg(&cloud.url);
+        }
     }
     let status = run_to_end(&mut vehicle).map_err(failed)?;
-    cloud.stop()?;
+    cloud.map_or(Ok(()), DemoCloud::stop)?;
     // It has printed its error.
     Ok(status.code().and_then(Exit::from_code).unwrap_or(Exit::Internal))
 }

@@ -1,5 +1,6 @@
-//! A run of the examples on a vehicle: deployed by the cloud, fed over DDS, one of them killed, and
-//! the clips that reached the cloud verified. Each expectation that is not met is an error.
+//! A run of the examples on a vehicle: deployed, fed over DDS, one of them killed, and the clips
+//! verified. With a cloud, it deploys them, and the clips are those that reached it. Each
+//! expectation that is not met is an error.
 
 use std::collections::BTreeSet;
 use std::ffi::OsString;
@@ -28,6 +29,9 @@ use crate::examples::{DRIVE, EXAMPLES, Example};
 /// The command of xtask that runs it: for the demo only.
 pub(crate) const COMMAND: &str = "demo-vehicle";
 
+/// The argument of [`COMMAND`] for a vehicle of a cloud.
+pub(super) const BY_CLOUD: &str = "by-cloud";
+
 /// The part of the drive that is played, in s: it has a trigger of each example.
 const PLAYED_S: u32 = 20;
 
@@ -46,19 +50,22 @@ const VICTIM: (&str, u64) = ("hello-python", 800);
 /// The lambda whose decisions are repeated from the clips: it keeps no state.
 const REPEATED: &str = "hello-rust";
 
-/// Runs everything, and prints a line for each result. The arguments are the folder of the sockets
-/// of the relay, and the address of the page if that is left open until SIGTERM.
+/// Runs everything, and prints a line for each result. The arguments are the folder of the sockets,
+/// [`BY_CLOUD`] if there is a cloud, and the address of its page if that is left open until
+/// SIGTERM.
 pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
-    let (run, page) = match arguments {
-        [run] => (Path::new(run), None),
-        [run, page] => (Path::new(run), page.to_str()),
+    let (run, has_cloud, page) = match arguments {
+        [run] => (Path::new(run), false, None),
+        [run, by] if by == BY_CLOUD => (Path::new(run), true, None),
+        [run, by, page] if by == BY_CLOUD => (Path::new(run), true, page.to_str()),
         _ => return Err(Failure::new(Exit::Usage, "it is a part of `cargo xtask demo`")),
     };
     relay::into(&run.join("relay")).map_err(|error| {
         Failure::caused_by(Exit::Internal, "cannot reach the cloud from the vehicle", &error)
     })?;
-    let vehicle = DemoVehicle::start(checkout, run)?;
-    println!("{NAME} has keys and a trust root, runs gleaner-orchestrator, and is enrolled\n");
+    let vehicle = DemoVehicle::start(checkout, run, has_cloud)?;
+    let enrolled = if has_cloud { ", and is enrolled" } else { "" };
+    println!("{NAME} has keys and a trust root, runs gleaner-orchestrator{enrolled}\n");
     let lambdas = EXAMPLES.iter().flat_map(|it| LANGUAGES.map(|language| (it, language)));
     let mut ids = Vec::new();
     for (example, language) in lambdas {
@@ -86,7 +93,9 @@ pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, F
         return Err(Failure::new(Exit::Differs, format!("`{id}` does not run at the end")));
     }
     let recorded = clips(&checkout.path(file("state/clips")))?;
-    arrivals::run(&vehicle, &ids, &recorded)?;
+    if has_cloud {
+        arrivals::run(&vehicle, &ids, &recorded)?;
+    }
     let vehicles = checkout.path(file("vehicles"));
     fs::write(&vehicles, format!("{} {}\n", status.vehicle, status.key))
         .map_err(|error| Failure::caused_by(Exit::Internal, "cannot write `vehicles`", &error))?;
@@ -118,8 +127,7 @@ fn leave_open(vehicle: &DemoVehicle, page: &str) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Publishes a twin, and deploys it by the cloud, under a name of its own, as a vehicle runs each
-/// name once.
+/// Publishes a twin, and deploys it under a name of its own, as a vehicle runs each name once.
 fn deploy(
     checkout: &Checkout,
     vehicle: &DemoVehicle,
@@ -146,7 +154,10 @@ fn deploy(
     })?;
     vehicle.gleaner(&["publish", &to, "--key", &file("publisher.pem")])?;
     let key = file("deployer.pem");
-    let mut arguments = vec!["deploy", "--fleet", &to, "--key", &key, "--label", "fleet=demo"];
+    let mut arguments = vec!["deploy", &to, "--key", &key];
+    let target: &[_] =
+        if vehicle.has_cloud { &["--fleet", "--label", "fleet=demo"] } else { &["--local"] };
+    arguments.extend(target);
     arguments.extend(example.set.iter().flat_map(|set| ["--set", *set]));
     let started = Instant::now();
     vehicle.gleaner(&arguments)?;
@@ -195,14 +206,15 @@ fn kill(vehicle: &DemoVehicle) -> Result<(), Failure> {
         "  kill -9 {pid}: `{id}` runs again after {:.1} s, restarts {before} -> {restarts}",
         killed.elapsed().as_secs_f64()
     );
-    let event = vehicle.look_until("its failure as an event in the cloud", || {
-        let events = vehicle.gleaner(&["events", "--on", NAME, "--json"])?;
+    let on: &[_] = if vehicle.has_cloud { &["--on", NAME] } else { &[] };
+    let event = vehicle.look_until("its failure as an event", || {
+        let events = vehicle.gleaner(&[&["events", "--json"], on].concat())?;
         let mut events =
             events.lines().filter_map(|line| serde_json::from_str::<StreamLine>(line).ok());
         Ok(events.find(|it| it.record["event"] == "failed" && it.record["lambda"] == id))
     })?;
     let text = visible(event.record["text"].as_str().unwrap_or_default());
-    println!("  gleaner events --on {NAME}: {text}");
+    println!("  $ gleaner {}: {text}", [&["events"], on].concat().join(" "));
     Ok(())
 }
 
@@ -237,7 +249,7 @@ fn verify(vehicle: &DemoVehicle, recorded: &[Clip]) -> Result<(), Failure> {
     println!("clips, verified with `gleaner verify CLIP --trust {trust}`:");
     let mut all = 0;
     for clip in recorded {
-        let path = clip_path(clip);
+        let path = clip_path(vehicle, clip);
         vehicle.gleaner(&["verify", &path, "--trust", &trust])?;
         println!("  {path}\n    {}", clip_contents(clip));
         // A lambda that was started again in the clip is in it twice.
@@ -270,7 +282,7 @@ fn verify(vehicle: &DemoVehicle, recorded: &[Clip]) -> Result<(), Failure> {
 fn report(vehicle: &DemoVehicle, recorded: &[Clip]) -> Result<(), Failure> {
     let of_lambda = |clip: &&Clip| clip.lambdas.iter().any(|lambda| lambda.name == REPEATED);
     let Some(clip) = recorded.iter().find(of_lambda) else { return Ok(()) };
-    let (lambda, out, path) = (folder(REPEATED), file("report"), clip_path(clip));
+    let (lambda, out, path) = (folder(REPEATED), file("report"), clip_path(vehicle, clip));
     let settings = EXAMPLES.iter().find(|it| REPEATED.starts_with(it.name));
     let settings = settings.into_iter().flat_map(|it| it.set).flat_map(|set| ["--set", *set]);
     let mut arguments = vec!["replay", &lambda, &path, "--out", &out];
@@ -285,10 +297,14 @@ fn folder(name: &str) -> String {
     file(&format!("lambdas/{name}"))
 }
 
-/// Path of a clip as it came from the cloud, relative to the checkout.
-fn clip_path(clip: &Clip) -> String {
-    let name = clip.file.file_name().unwrap_or_default();
-    file(&format!("cloud-clips/{NAME}/{}", name.display()))
+/// Path of a clip, relative to the checkout: as it came from the cloud, if there is one.
+fn clip_path(vehicle: &DemoVehicle, clip: &Clip) -> String {
+    let name = clip.file.file_name().unwrap_or_default().display();
+    if vehicle.has_cloud {
+        file(&format!("cloud-clips/{NAME}/{name}"))
+    } else {
+        file(&format!("state/clips/{name}"))
+    }
 }
 
 /// Copies all files and folders in `from` to `to`.

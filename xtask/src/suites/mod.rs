@@ -1,14 +1,20 @@
-//! `cargo xtask test`: runs all test suites one after the other, and prints the total counts.
+//! `cargo xtask test`: runs all test suites, two at a time, and prints the total counts.
 //!
-//! All suites run even if one fails. `counts` parses the output of the different test runners.
+//! All suites run even if one fails. `junit` and `counts` read the results of their test runners.
 
 mod counts;
+mod junit;
 mod memory;
 
+use std::collections::VecDeque;
 use std::env;
+use std::ffi::OsString;
+use std::fs;
 use std::io::{self, BufRead, BufReader, Write};
 use std::path::PathBuf;
 use std::process::{Command, ExitStatus, Stdio};
+use std::sync::Mutex;
+use std::thread;
 use std::time::Instant;
 
 use gleaner_base::{Exit, Failure};
@@ -16,14 +22,22 @@ use gleaner_base::{Exit, Failure};
 use crate::bindings;
 use crate::checkout::{Checkout, FAMILIES};
 use crate::fuzz;
+use crate::metadata::Metadata;
 use crate::player;
 use crate::setup;
 use crate::steps::{Steps, succeeds};
 use crate::venv;
-use counts::{OutputFormat, TestCounts};
+use counts::{LibtestParser, TestCounts};
 
 /// Features with which `.ci/run` checks the workspace.
-const LINTED: &str = "gleaner-fuzz/calls,gleaner-fuzz/programs";
+const LINTED: &str = "gleaner-fuzz/programs";
+
+/// Test programs that receive samples in real time, or kill processes at chosen moments: none runs
+/// beside another of them. `.config/nextest.toml` has the same list.
+const REAL_TIME: [&str; 5] = ["attacks", "dds", "kills", "live", "vehicle"];
+
+/// Number of suites that run at a time. Most tests wait for processes and clocks.
+const AT_A_TIME: usize = 2;
 
 struct Suite {
     name: String,
@@ -31,128 +45,251 @@ struct Suite {
 }
 
 enum SuiteAction {
-    Run(Command, OutputFormat),
+    Run(Box<Command>, SuiteResults),
     /// Skips the suite for this reason. It counts as one skipped test.
     Skip(&'static str),
 }
 
-/// Sets up and runs all tests. The last line is `N passed, M failed, K skipped`.
-pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
-    let mut suites = suites(checkout);
-    suites.extend(player_suites(checkout)?);
-    let mut steps = Steps::of(setup::STEPS + 1 + suites.len());
+/// The results of a suite.
+enum SuiteResults {
+    /// Lines of Rust test programs.
+    Libtest,
+    /// A file, written at the end.
+    JUnit(PathBuf),
+    /// The exit status, as the result of one test.
+    Status,
+}
+
+/// A suite that has ended.
+struct EndedSuite {
+    name: String,
+    counts: TestCounts,
+    seconds: f64,
+}
+
+/// Tests that read files in the folder of `GLEANER_SHARED`, and those of the pages, as packages
+/// with their test programs. A test compares the list with the sources.
+const READ_SHARED: &str = "binary(drives) | binary(house) | binary(vision) \
+                           | package(gleaner-inference) & binary(suite) | package(imu-fft)";
+
+/// Sets up and runs all tests, or with `--shared` those of [`READ_SHARED`]. The last line is
+/// `N passed, M failed, K skipped`.
+pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
+    match arguments {
+        [] => run_tests(checkout),
+        [one] if one == "--shared" => run_shared(checkout),
+        _ => Err(Failure::new(Exit::Usage, "`cargo xtask test` takes `--shared` or nothing")),
+    }
+}
+
+fn run_shared(checkout: &Checkout) -> Result<Exit, Failure> {
+    let mut suites = if has_nextest(checkout) {
+        vec![nextest(checkout, &["-E", READ_SHARED])]
+    } else {
+        let programs = ["--test", "drives", "--test", "house", "--test", "vision"];
+        let tests = cargo_test(checkout, &[&programs[..], &["--test", "suite", "--lib"]].concat());
+        vec![suite("cargo test", tests, SuiteResults::Libtest)]
+    };
+    suites.push(pytest(checkout, "examples", &["examples"]));
+    Ok(report(run_all(suites)))
+}
+
+fn run_tests(checkout: &Checkout) -> Result<Exit, Failure> {
+    let mut steps = Steps::of(setup::STEPS + 2);
     setup::run(checkout, &mut steps, &checkout.lambdas(&FAMILIES))?;
     fuzz::driver(checkout)?;
     steps.begin("mypy, pytest, drive readers and notebook tools");
     venv::set_up_for_tests(checkout)?;
-    let mut total = TestCounts::new(OutputFormat::None);
-    let mut table =
-        format!("\n{:<44} {:>7} {:>7} {:>7} {:>7}\n", "suite", "passed", "failed", "skipped", "s");
+    let mut suites = suites(checkout)?;
+    suites.extend(player_suites(checkout)?);
+    steps.begin(&format!("{} suites, {AT_A_TIME} at a time", suites.len()));
     let folder = memory::MemoryFolder::new();
-    for mut suite in suites {
-        steps.begin(&suite.name);
+    for suite in &mut suites {
         if let (Some(folder), SuiteAction::Run(command, _)) = (&folder, &mut suite.action) {
             command.env("TMPDIR", folder.path());
         }
-        let started = Instant::now();
-        let counts = suite.action.run();
-        let seconds = started.elapsed().as_secs_f64();
-        let TestCounts { passed, failed, skipped, .. } = &counts;
-        table +=
-            &format!("{:<44} {passed:>7} {failed:>7} {skipped:>7} {seconds:>7.1}\n", suite.name);
-        total.add(counts, &suite.name);
     }
-    print!("{table}");
-    for name in &total.names {
-        println!("FAILED {name}");
-    }
-    println!("{} passed, {} failed, {} skipped", total.passed, total.failed, total.skipped);
-    Ok(if total.failed == 0 { Exit::Ok } else { Exit::Internal })
+    Ok(report(run_all(suites)))
 }
 
-fn suites(checkout: &Checkout) -> Vec<Suite> {
-    let suite = |name: &str, command, format| Suite {
-        name: name.to_owned(),
-        action: SuiteAction::Run(command, format),
+/// Runs the suites, each with its output in one block, except the first, whose output is shown as
+/// it comes.
+fn run_all(suites: Vec<Suite>) -> Vec<EndedSuite> {
+    let waiting = Mutex::new(suites.into_iter().enumerate().collect::<VecDeque<_>>());
+    let ended = Mutex::new(Vec::new());
+    let next = || waiting.lock().unwrap_or_else(|it| it.into_inner()).pop_front();
+    let work = || {
+        while let Some((index, Suite { name, action })) = next() {
+            let mut output = SuiteOutput { block: Vec::new(), is_shown: index == 0 };
+            output.line(format!("== {name} ==\n").as_bytes());
+            let started = Instant::now();
+            let counts = action.run(&mut output);
+            let seconds = started.elapsed().as_secs_f64();
+            output.end();
+            let suite = EndedSuite { name, counts, seconds };
+            ended.lock().unwrap_or_else(|it| it.into_inner()).push((index, suite));
+        }
     };
+    thread::scope(|scope| {
+        for _ in 0..AT_A_TIME {
+            scope.spawn(work);
+        }
+    });
+    let mut ended = ended.into_inner().unwrap_or_else(|it| it.into_inner());
+    ended.sort_by_key(|(index, _)| *index);
+    ended.into_iter().map(|(_, suite)| suite).collect()
+}
 
-    let mut tests = checkout.cargo();
-    tests.args(["test", "--release", "--no-fail-fast"]);
+/// SuiteOutput of a suite: shown, or collected until its end.
+struct SuiteOutput {
+    block: Vec<u8>,
+    is_shown: bool,
+}
 
-    // Seeds of the fuzz targets, with the features of the default build, so that nothing is built
-    // twice.
-    let mut seeds = checkout.cargo();
-    seeds.args([
-        "test",
-        "--release",
-        "--workspace",
-        "--exclude",
-        "gleaner-player",
-        "--features",
-        "gleaner-fuzz/calls",
-    ]);
-    seeds.args(["--test", "seeds"]);
+impl SuiteOutput {
+    fn line(&mut self, line: &[u8]) {
+        self.block.extend_from_slice(line);
+        if self.is_shown {
+            self.end();
+        }
+    }
 
+    fn end(&mut self) {
+        let mut out = io::stdout().lock();
+        let _ = out.write_all(&self.block).and_then(|()| out.flush());
+        self.block.clear();
+    }
+}
+
+/// Prints the counts of each suite, the skipped and the failed tests, and the total.
+fn report(suites: Vec<EndedSuite>) -> Exit {
+    println!("\n{:<44} {:>7} {:>7} {:>7} {:>7}", "suite", "passed", "failed", "skipped", "s");
+    let mut total = TestCounts::default();
+    for EndedSuite { name, counts, seconds } in suites {
+        let (passed, failed, skipped) = (counts.passed, counts.failed.len(), counts.skipped.len());
+        println!("{name:<44} {passed:>7} {failed:>7} {skipped:>7} {seconds:>7.1}");
+        total.add(counts, &name);
+    }
+    for name in &total.skipped {
+        println!("skipped {name}");
+    }
+    for name in &total.failed {
+        println!("FAILED {name}");
+    }
+    let (failed, skipped) = (total.failed.len(), total.skipped.len());
+    println!("{} passed, {failed} failed, {skipped} skipped", total.passed);
+    if failed == 0 { Exit::Ok } else { Exit::Internal }
+}
+
+fn suite(name: &str, command: Command, results: SuiteResults) -> Suite {
+    Suite { name: name.to_owned(), action: SuiteAction::Run(Box::new(command), results) }
+}
+
+fn has_nextest(checkout: &Checkout) -> bool {
+    succeeds(checkout.cargo().args(["nextest", "--version"]))
+}
+
+/// Runs tests of the default members, each in a process of its own.
+fn nextest(checkout: &Checkout, arguments: &[&str]) -> Suite {
+    let mut nextest = checkout.cargo();
+    nextest.args(["nextest", "run", "--release"]).args(arguments);
+    let results = checkout.target().join("nextest/default/junit.xml");
+    suite("cargo nextest", nextest, SuiteResults::JUnit(results))
+}
+
+/// Returns the command that runs test programs of the default members, one after the other.
+fn cargo_test(checkout: &Checkout, arguments: &[&str]) -> Command {
+    let mut test = checkout.cargo();
+    test.args(["test", "--release", "--no-fail-fast"]).args(arguments);
+    test.args(["--", "--show-output"]);
+    test
+}
+
+/// The tests of the default members. To build nextest takes minutes, so it is used where it is
+/// installed; cargo alone runs the same tests.
+fn rust_tests(checkout: &Checkout) -> Result<Vec<Suite>, Failure> {
+    let test = |name: &str, arguments: &[&str]| {
+        suite(
+            &format!("cargo test: {name}"),
+            cargo_test(checkout, arguments),
+            SuiteResults::Libtest,
+        )
+    };
+    let mut suites = if has_nextest(checkout) {
+        vec![nextest(checkout, &[])]
+    } else {
+        let others = test_programs(checkout)?;
+        let others: Vec<_> = others.iter().flat_map(|name| ["--test", name]).collect();
+        vec![
+            test("programs", &others),
+            test("programs in real time", &REAL_TIME.map(|name| ["--test", name]).concat()),
+            test("units", &["--lib", "--bins", "--examples"]),
+        ]
+    };
+    // nextest does not run the examples of the documentation.
+    suites.push(test("examples of the documentation", &["--doc"]));
+    Ok(suites)
+}
+
+/// Names of the test programs of the default members, without those in [`REAL_TIME`].
+fn test_programs(checkout: &Checkout) -> Result<Vec<String>, Failure> {
+    let metadata = Metadata::read(checkout)?;
+    let targets = metadata.default_members().flat_map(|package| &package.targets);
+    let tests = targets.filter(|target| target.kind == ["test"] && target.test);
+    let mut names: Vec<_> = tests
+        .map(|target| target.name.clone())
+        .filter(|name| !REAL_TIME.contains(&name.as_str()))
+        .collect();
+    names.sort();
+    names.dedup();
+    Ok(names)
+}
+
+fn suites(checkout: &Checkout) -> Result<Vec<Suite>, Failure> {
     // In a separate target folder, since its flags would recompile everything else.
     let mut loom = checkout.cargo();
-    loom.args([
-        "test",
-        "--release",
-        "-p",
-        "gleaner-buffers",
-        "--test",
-        "loom",
-        "--test",
-        "loom_shared",
-    ])
-    .env("CARGO_TARGET_DIR", checkout.target().join("loom"))
-    .env("RUSTFLAGS", "--cfg loom")
-    .env("LOOM_MAX_PREEMPTIONS", "3");
+    loom.args(["test", "--release", "-p", "gleaner-buffers", "--test", "loom"])
+        .env("CARGO_TARGET_DIR", checkout.target().join("loom"))
+        .env("RUSTFLAGS", "--cfg loom")
+        .env("LOOM_MAX_PREEMPTIONS", "3");
 
-    let mut unittest = checkout.command(checkout.python());
-    unittest
-        .args(["-m", "unittest", "discover", "-v", "guest-sdk-python/tests"])
-        .env("GLEANER_EXTENSION", checkout.program("lib_gleaner.so"))
-        .env("GLEANER_CLOUD_PROGRAM", checkout.program("gleaner-cloud"));
-
-    // As users test lambdas, with the SDK of this checkout.
-    let mut pytest = checkout.command(checkout.python());
-    pytest
-        .args([
-            "-m",
-            "pytest",
-            "-q",
-            "-rs",
-            "-p",
-            "no:cacheprovider",
-            "examples",
-            "bench/baselines",
-        ])
-        .env("PYTHONPATH", checkout.path("guest-sdk-python"))
-        .env("PYTHONDONTWRITEBYTECODE", "1");
-
-    let mut suites = vec![
-        suite("cargo test", tests, OutputFormat::Libtest),
-        suite("cargo test: seeds of the fuzz targets", seeds, OutputFormat::Libtest),
+    let mut suites = rust_tests(checkout)?;
+    suites.extend([
         suite(
             "cargo test: bindings of the Rust SDK",
             bindings::test(checkout),
-            OutputFormat::Libtest,
+            SuiteResults::Libtest,
         ),
-        suite("loom: orders of threads in gleaner-buffers", loom, OutputFormat::Libtest),
+        suite("loom: orders of threads in gleaner-buffers", loom, SuiteResults::Libtest),
         Suite { name: "miri: memory in gleaner-buffers".to_owned(), action: miri(checkout) },
-        suite("unittest: Python SDK", unittest, OutputFormat::Unittest),
-        suite("pytest: examples, notebooks and baselines", pytest, OutputFormat::Pytest),
-    ];
+        pytest(checkout, "Python SDK", &["guest-sdk-python/tests"]),
+        // As users test lambdas, with the SDK of this checkout.
+        pytest(checkout, "examples, notebooks and baselines", &["examples", "bench/baselines"]),
+    ]);
     suites.extend(typed(checkout).into_iter().map(|file| {
         let mut mypy = checkout.command(checkout.python());
         mypy.args(["-m", "mypy", "--strict", "--cache-dir"])
             .arg(checkout.target().join("mypy"))
             .arg(&file)
             .env("MYPYPATH", checkout.path("guest-sdk-python"));
-        suite(&format!("mypy: {}", file.display()), mypy, OutputFormat::None)
+        suite(&format!("mypy: {}", file.display()), mypy, SuiteResults::Status)
     }));
-    suites
+    Ok(suites)
+}
+
+/// The tests in these folders, relative to the checkout, by pytest.
+fn pytest(checkout: &Checkout, name: &str, folders: &[&str]) -> Suite {
+    let results = checkout.target().join(format!("pytest/{name}.xml"));
+    let mut pytest = checkout.command(checkout.python());
+    pytest.args(["-m", "pytest", "-q", "-p", "no:cacheprovider", "--junit-xml"]);
+    pytest
+        .arg(&results)
+        .args(folders)
+        .env("GLEANER_EXTENSION", checkout.program("lib_gleaner.so"))
+        .env("GLEANER_CLOUD_PROGRAM", checkout.program("gleaner-cloud"))
+        .env("PYTHONPATH", checkout.path("guest-sdk-python"))
+        .env("PYTHONDONTWRITEBYTECODE", "1");
+    suite(&format!("pytest: {name}"), pytest, SuiteResults::JUnit(results))
 }
 
 /// Suites of the player, if it was built: it is not a default member.
@@ -172,8 +309,8 @@ fn player_suites(checkout: &Checkout) -> Result<Vec<Suite>, Failure> {
     let mut tests = player::cargo(checkout, &player::compiler())?;
     tests.arg("test").args(only);
     Ok(vec![
-        suite("lints: player", SuiteAction::Run(lints, OutputFormat::None)),
-        suite("cargo test: player", SuiteAction::Run(tests, OutputFormat::Libtest)),
+        suite("lints: player", SuiteAction::Run(Box::new(lints), SuiteResults::Status)),
+        suite("cargo test: player", SuiteAction::Run(Box::new(tests), SuiteResults::Libtest)),
     ])
 }
 
@@ -208,33 +345,76 @@ fn miri(checkout: &Checkout) -> SuiteAction {
     if env::var_os("MIRIFLAGS").is_none() {
         tests.env("MIRIFLAGS", "-Zmiri-strict-provenance");
     }
-    SuiteAction::Run(tests, OutputFormat::Libtest)
+    SuiteAction::Run(Box::new(tests), SuiteResults::Libtest)
 }
 
 impl SuiteAction {
-    fn run(self) -> TestCounts {
+    fn run(self, output: &mut SuiteOutput) -> TestCounts {
         match self {
             SuiteAction::Skip(why) => {
-                println!("skipped: {why}");
-                let mut counts = TestCounts::new(OutputFormat::None);
-                counts.skipped = 1;
+                output.line(format!("skipped: {why}\n").as_bytes());
+                let mut counts = TestCounts::default();
+                counts.skip("all", why);
                 counts
             }
-            SuiteAction::Run(command, format) => {
+            SuiteAction::Run(command, results) => {
                 let program = command.get_program().display().to_string();
-                let mut counts = TestCounts::new(format);
-                match run_and_count(command, &mut counts) {
-                    Ok(status) => counts.end(status.success(), &format!("ended with {status}")),
-                    Err(error) => counts.end(false, &format!("cannot run `{program}`: {error}")),
+                if let SuiteResults::JUnit(file) = &results {
+                    // That of an earlier run would count.
+                    let _ = fs::remove_file(file);
                 }
-                counts
+                let mut parser = LibtestParser::default();
+                let ended = show(*command, output, |line| results.parse_line(&mut parser, line));
+                let (is_success, status) = match ended {
+                    Ok(status) => (status.success(), format!("ended with {status}")),
+                    Err(error) => (false, format!("cannot run `{program}`: {error}")),
+                };
+                results.count(parser, is_success, &status)
             }
         }
     }
 }
 
-/// Runs a suite, shows the output of both streams in order, and counts the tests in it.
-fn run_and_count(mut command: Command, counts: &mut TestCounts) -> io::Result<ExitStatus> {
+impl SuiteResults {
+    fn parse_line(&self, parser: &mut LibtestParser, line: &str) {
+        match self {
+            SuiteResults::Libtest => parser.parse_line(line),
+            // Only here does nextest name the tests that it skips, such as
+            // `SKIP [         ] (───) gleaner-tests::dds a_name [no network]`.
+            SuiteResults::JUnit(_) => {
+                let skipped = line.trim_start().strip_prefix("SKIP [");
+                if let Some((_, name)) = skipped.and_then(|rest| rest.split_once(") ")) {
+                    let (name, reason) = name.split_once(" [").unwrap_or((name, "ignored"));
+                    parser.counts.skip(name, reason.trim_end_matches(']'));
+                }
+            }
+            SuiteResults::Status => {}
+        }
+    }
+
+    fn count(&self, mut parser: LibtestParser, is_success: bool, status: &str) -> TestCounts {
+        parser.close();
+        let mut counts = parser.counts;
+        match self {
+            SuiteResults::Libtest => {}
+            SuiteResults::JUnit(file) => {
+                if let Err(error) = junit::add(&mut counts, file) {
+                    counts.fail(&format!("{status}; no results in `{}`: {error}", file.display()));
+                }
+            }
+            SuiteResults::Status => counts.passed = u64::from(is_success),
+        }
+        counts.end(is_success, status);
+        counts
+    }
+}
+
+/// Runs a suite, shows the output of both streams in order, and passes each line to `parse`.
+fn show(
+    mut command: Command,
+    output: &mut SuiteOutput,
+    mut parse: impl FnMut(&str),
+) -> io::Result<ExitStatus> {
     let (reader, writer) = io::pipe()?;
     let mut child =
         command.stdin(Stdio::null()).stdout(writer.try_clone()?).stderr(writer).spawn()?;
@@ -243,10 +423,8 @@ fn run_and_count(mut command: Command, counts: &mut TestCounts) -> io::Result<Ex
     let mut reader = BufReader::new(reader);
     let mut line = Vec::new();
     while reader.read_until(b'\n', &mut line)? > 0 {
-        let mut out = io::stdout().lock();
-        out.write_all(&line)?;
-        out.flush()?;
-        counts.parse_line(String::from_utf8_lossy(&line).trim_end());
+        output.line(&line);
+        parse(String::from_utf8_lossy(&line).trim_end());
         line.clear();
     }
     child.wait()

@@ -7,5 +7,7 @@ mod onnx_runtime;
 mod parity;
 mod refusing;
 mod running;
+#[path = "../../../../base/src/shared_data.rs"]
+mod shared_data;
 mod sharing;
 mod support;

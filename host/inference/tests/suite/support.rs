@@ -5,7 +5,7 @@ use std::io::{BufRead, BufReader, Read, Seek, SeekFrom, Write};
 use std::os::fd::{AsFd, OwnedFd};
 use std::os::unix::fs::FileExt;
 use std::os::unix::net::UnixStream;
-use std::path::Path;
+use std::path::PathBuf;
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
@@ -17,6 +17,8 @@ use gleaner_protocol::inference::{
     ModelFile, ModelResult, ModelState, ModelWait, TensorInfo, TensorPlace,
 };
 use sha2::{Digest, Sha256};
+
+use crate::shared_data::shared_file;
 
 /// Time after which an awaited event is missing.
 pub const TIMEOUT: Duration = Duration::from_secs(60);
@@ -367,15 +369,7 @@ pub fn wait_for<T>(mut find: impl FnMut() -> Option<T>) -> T {
     }
 }
 
-/// Returns a file of the shared test data, if this checkout has it.
-pub fn shared(path: &str) -> Option<std::path::PathBuf> {
-    let folder = std::env::var_os("GLEANER_SHARED").map(std::path::PathBuf::from);
-    let folder =
-        folder.unwrap_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared"));
-    let path = folder.join("data").join(path);
-    if path.exists() {
-        return Some(path);
-    }
-    println!("skipped: there is no `{}`", path.display());
-    None
+/// Returns a file of the shared test data, if there is one.
+pub fn shared(path: &str) -> Option<PathBuf> {
+    shared_file(path).inspect_err(|why| println!("skipped: {why}")).ok()
 }

@@ -3,11 +3,12 @@
 //! The pictures are not part of the repository. Without them the tests print so and pass.
 
 use std::fs;
-use std::path::{Path, PathBuf};
 
 use gleaner_image::{decode_rgb8, probe};
 use gleaner_rules::pixels::{Encoding, View};
 use gleaner_vision::{DetectorLayout, Placement, Preprocess, prepare};
+
+use crate::shared_data::shared_file;
 
 /// A decoded picture.
 struct Picture {
@@ -18,12 +19,8 @@ struct Picture {
 
 /// Reads a picture of the shared data, if it is there.
 fn picture(name: &str) -> Option<Picture> {
-    let path: PathBuf =
-        Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data").join(name);
-    let Ok(bytes) = fs::read(&path) else {
-        eprintln!("skipped: there is no {}", path.display());
-        return None;
-    };
+    let path = shared_file(name).inspect_err(|why| println!("skipped: {why}")).ok()?;
+    let bytes = fs::read(&path).unwrap();
     let header = probe(&bytes).unwrap();
     let mut rgb = vec![0; header.rgb8_len().unwrap()];
     decode_rgb8(&bytes, &header, rgb.len(), &mut rgb).unwrap();

@@ -4,3 +4,5 @@
 mod data;
 mod detect;
 mod prepare;
+#[path = "../../../../base/src/shared_data.rs"]
+mod shared_data;

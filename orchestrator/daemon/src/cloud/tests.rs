@@ -204,6 +204,7 @@ fn frame(body: Body) -> Message {
 }
 
 #[tokio::test]
+#[expect(clippy::too_many_lines, reason = "one list of all cases, which share their helpers")]
 async fn a_wanted_state_that_is_not_accepted_is_refused_and_what_runs_is_left_alone() {
     let mut vehicle = LinkedVehicle::new().await;
     vehicle.api.core.install_root(&root(1, now() + DAY)).unwrap();

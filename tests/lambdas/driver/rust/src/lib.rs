@@ -61,6 +61,7 @@ impl HeldObjects {
         }
     }
 
+    #[expect(clippy::too_many_lines, reason = "one short arm for each operation")]
     fn call(&mut self, operation: Operation, bytes: &mut Bytes) {
         match operation {
             Operation::Input => self.topics.extend(match bytes.u8() % 4 {

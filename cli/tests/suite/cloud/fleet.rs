@@ -1,0 +1,309 @@
+//! `fleet`, and `deploy`, `start`, `stop`, `rollback` and `remove` with `--fleet`.
+
+use std::fs;
+
+use gleaner_protocol::vehicle_api::DeployRequest;
+use gleaner_trust::{Deployment, Floors, Labels, RootKeys, ScopedKey, TrustRoot, Verifier};
+use serde_json::{Value, json};
+
+use super::CloudUser;
+use super::vehicles::status;
+use crate::programs;
+
+const MANIFEST: &str = "lambda = { name = 'brake', version = '0.2.0', kind = 'python', entry = 'main.py' }\nschedule.period = '1s'\n";
+
+const DEPLOY: [&str; 5] = ["deploy", "brake", "--fleet", "--key", "key.pem"];
+
+impl CloudUser {
+    /// A user who has logged in and published the lambda `brake`.
+    fn with_lambda() -> Self {
+        let user = Self::logged_in();
+        fs::create_dir(user.path("brake")).unwrap();
+        fs::write(user.path("brake/lambda.toml"), MANIFEST).unwrap();
+        fs::write(user.path("brake/main.py"), "x = 0\n").unwrap();
+        user.done(&["keys", "new", "key.pem"]);
+        user.done(&["build", "brake"]);
+        user.done(&["publish", "brake", "--key", "key.pem"]);
+        user.cloud.answers("GET /v1/deployments", &[(200, list(json!([])))]);
+        user.cloud.answers("POST /v1/deployments", &[(200, accepted())]);
+        user.cloud.seen();
+        user
+    }
+
+    /// Sets the vehicles of the cloud, each with its labels.
+    fn vehicles(&self, vehicles: &[(&str, &str, Value)]) {
+        let vehicles = vehicles.iter().map(|(name, state, labels)| {
+            json!({
+                "name": name, "labels": labels, "state": state, "seen": 1, "version": "1",
+                "wanted": 3, "handled": 3, "problems": [], "running": 0, "deployments": 1,
+            })
+        });
+        self.cloud.answers("GET /v1/vehicles", &[(200, list(vehicles.collect()))]);
+    }
+
+    /// Sets the statuses of a vehicle, in turn: one for each value.
+    fn statuses(&self, vehicle: &str, deployments: &[Value]) {
+        let statuses = deployments.iter().map(|it| (200, status(std::slice::from_ref(it))));
+        let line = format!("GET /v1/vehicles/{vehicle}/status");
+        self.cloud.answers(&line, &statuses.collect::<Vec<_>>());
+    }
+
+    /// Returns the deployment that was sent last, as a vehicle that trusts the key.
+    fn sent(&self) -> Deployment {
+        let shown: Value = self.json(&["keys", "show", "key.pem"]);
+        let key = ScopedKey {
+            key: shown["public"].as_str().unwrap().parse().unwrap(),
+            lambdas: vec!["*".parse().unwrap()],
+            labels: Labels::new(),
+        };
+        let root = TrustRoot {
+            version: 1,
+            created: 0,
+            expires: 1,
+            root: RootKeys { threshold: 1, keys: vec![key.key.clone()] },
+            publishers: Vec::new(),
+            deployers: vec![key],
+        };
+        let labels = Labels::from([("site".parse().unwrap(), "berlin".to_owned())]);
+        let floors = Floors::default();
+        let vehicle = Verifier { root: &root, floors: &floors, labels: &labels, now: 0 };
+        let seen = self.cloud.seen();
+        let request = seen.iter().rfind(|it| it.line == "POST /v1/deployments").unwrap();
+        let request: DeployRequest = serde_json::from_slice(&request.body).unwrap();
+        vehicle.deployment(request.deployment.as_bytes()).unwrap().payload().clone()
+    }
+}
+
+/// Returns a list with these entries.
+fn list(items: Value) -> Value {
+    json!({ "items": items })
+}
+
+fn accepted() -> Value {
+    json!({ "result": "accepted", "id": "brake", "attempt": 0, "generation": 3 })
+}
+
+fn on_vehicle(release: u64, phase: &str) -> Value {
+    json!({
+        "id": "brake", "release": release, "attempt": 5, "lambda": "brake",
+        "revision": { "digest": "new", "version": "0.2.0", "release": 1 },
+        "fallback": null, "grants": { "topics": [], "models": [], "record": false },
+        "is_wanted": true, "runs_fallback": false, "is_proven": false,
+        "status": {
+            "id": "brake", "name": "brake", "revision": "new", "attempt": 5, "phase": phase,
+            "phase_s": 1.0, "restarts": 0, "last_end": "exit code 1", "layers": [],
+        },
+    })
+}
+
+fn in_cloud(release: u64) -> Value {
+    json!({
+        "id": "brake", "release": release, "version": "v", "revision": "b".repeat(64),
+        "fallback": "a".repeat(64),
+        "grants": { "topics": ["/imu"], "models": [], "record": true },
+        "selector": { "site": "berlin" }, "is_wanted": true, "vehicles": 2, "running": 1,
+        "failed": 0,
+    })
+}
+
+#[test]
+fn a_deployment_to_a_fleet_sends_missing_files_and_waits_for_each_vehicle() {
+    let user = CloudUser::with_lambda();
+    user.cloud.answers("GET /v1/deployments", &[(200, list(json!([in_cloud(6)])))]);
+    let main = "x = 0\n";
+    let digest = gleaner_base::hex(&<sha2::Sha256 as sha2::Digest>::digest(main));
+    let missing = json!({
+        "result": "missing", "objects": [{ "sha256": digest, "bytes": main.len() }],
+    });
+    user.cloud.answers("POST /v1/deployments", &[(200, missing), (200, accepted())]);
+    let object = format!("PUT /v1/objects/{digest}");
+    user.cloud.answers(&object, &[(204, json!(null))]);
+    let berlin = || json!({ "site": "berlin" });
+    user.vehicles(&[
+        ("car-7", "online", berlin()),
+        ("car-8", "online", json!({ "site": "paris" })),
+        ("car-9", "online", berlin()),
+        ("new", "invited", json!({})),
+        ("stolen", "revoked", berlin()),
+    ]);
+    let running = on_vehicle(7, "running");
+    user.statuses("car-7", std::slice::from_ref(&running));
+    user.statuses("car-9", &[on_vehicle(6, "running"), on_vehicle(7, "starting"), running]);
+    let arguments = [&DEPLOY[..], &["--selector", "site=berlin"]].concat();
+    let text = user.done(&arguments);
+    assert_eq!(
+        text,
+        "deployed brake 0.2.0 as `brake` (release 7, 1 file sent)\n\
+         car-7: runs 0.2.0\ncar-9: runs 0.2.0\n`brake` runs on 2 vehicles\n"
+    );
+    let seen = user.cloud.seen();
+    assert_eq!(seen.iter().find(|it| it.line == object).unwrap().body, main.as_bytes());
+    let count = |line: &str| seen.iter().filter(|it| it.line == line).count();
+    assert_eq!(count("GET /v1/vehicles/car-7/status"), 1);
+    assert_eq!(count("GET /v1/vehicles/car-9/status"), 3);
+    let json = user.done(&[&arguments[..], &["--json"]].concat());
+    let json: Value = serde_json::from_str(&json).unwrap();
+    assert_eq!(json["vehicles"][1]["state"], "done", "{json}");
+    let sent = user.sent();
+    assert_eq!((sent.release, sent.selector.len()), (7, 1));
+    assert_eq!(sent.fallback.unwrap().to_string(), "b".repeat(64));
+    assert_eq!((sent.grants.topics.len(), sent.grants.record), (1, true));
+}
+
+#[test]
+fn the_error_of_a_fleet_names_each_vehicle_and_its_reason() {
+    let user = CloudUser::with_lambda();
+    user.vehicles(&[
+        ("car-7", "online", json!({})),
+        ("car-8", "online", json!({})),
+        ("car-9", "offline", json!({})),
+    ]);
+    user.statuses("car-7", &[on_vehicle(1, "running")]);
+    user.statuses("car-8", &[on_vehicle(1, "quarantined")]);
+    user.statuses("car-9", &[on_vehicle(0, "running")]);
+    let arguments = [&DEPLOY[..], &["--timeout", "1ms", "--release", "1"]].concat();
+    let text = user.fails(6, &arguments);
+    assert!(text.starts_with("error: `brake` runs on 1 of 3 vehicles\n"), "{text}");
+    for part in ["car-8: it does not run, and", "exit code 1", "car-9: it is offline, seen "] {
+        assert!(text.contains(part), "{text}");
+    }
+    user.statuses("car-8", &[on_vehicle(1, "starting")]);
+    let text = user.fails(4, &arguments);
+    assert!(text.contains("car-8: its lambda is starting"), "{text}");
+}
+
+#[test]
+fn a_deployment_without_a_vehicle_yet_is_no_error() {
+    let user = CloudUser::with_lambda();
+    user.vehicles(&[("car-8", "online", json!({ "site": "paris" }))]);
+    let text = user.done(&[&DEPLOY[..], &["--label", "site=berlin"]].concat());
+    assert!(text.contains("no vehicle has the labels yet"), "{text}");
+    assert_eq!(user.sent().release, 1);
+}
+
+#[test]
+fn the_release_follows_those_that_vehicles_remember() {
+    let user = CloudUser::with_lambda();
+    user.vehicles(&[("car-7", "online", json!({})), ("car-8", "offline", json!({}))]);
+    let mut removed = status(&[]);
+    removed["removed"] = json!({ "brake": 9 });
+    let done = (200, status(&[on_vehicle(10, "running")]));
+    user.cloud.answers("GET /v1/vehicles/car-7/status", &[(200, removed), done.clone()]);
+    user.cloud.answers("GET /v1/vehicles/car-8/status", &[done]);
+    // The cloud knows no deployment of this name, but a vehicle runs release 10 of one.
+    let text = user.fails(4, &[&DEPLOY[..], &["--timeout", "1ms"]].concat());
+    assert!(text.contains("car-8: it is offline, seen"), "{text}");
+    assert_eq!(user.sent().release, 11);
+}
+
+#[test]
+fn a_deployment_of_a_fleet_is_listed_changed_and_removed() {
+    let user = CloudUser::logged_in();
+    user.cloud.answers("GET /v1/deployments", &[(200, list(json!([in_cloud(6)])))]);
+    let text = user.done(&["fleet"]);
+    let words: Vec<_> = text.lines().nth(1).unwrap().split_whitespace().collect();
+    let row = ["brake", "6", "bbbbbbbbbbbb", "site=berlin", "wanted", "2", "1", "0"];
+    assert_eq!(words, row);
+    assert_eq!(user.json(&["fleet"]), json!([in_cloud(6)]));
+    user.vehicles(&[("car-7", "online", json!({ "site": "berlin" }))]);
+    let ended = |deployments: &[Value]| {
+        let mut status = status(deployments);
+        status["supervisor"] = json!({
+            "generation": 1, "up_s": 1.0, "lambdas": [], "clips": 0, "events_lost": 0,
+            "ingress": { "is_ready": true, "restarts": 0 },
+        });
+        (200, status)
+    };
+    let mut stopped = on_vehicle(6, "running");
+    stopped["is_wanted"] = json!(false);
+    stopped["status"] = json!(null);
+    user.cloud.answers("POST /v1/deployments/brake/stop", &[(200, in_cloud(6))]);
+    user.cloud.answers("GET /v1/vehicles/car-7/status", &[ended(&[stopped])]);
+    let text = user.done(&["stop", "brake", "--fleet"]);
+    assert_eq!(text, "car-7: is stopped\n`brake` is stopped on 1 vehicle\n");
+    user.cloud.answers("POST /v1/deployments/brake/start", &[(200, in_cloud(6))]);
+    user.statuses("car-7", &[on_vehicle(6, "starting"), on_vehicle(6, "running")]);
+    assert!(user.done(&["start", "brake", "--fleet"]).ends_with("`brake` runs on 1 vehicle\n"));
+    user.cloud.answers("POST /v1/deployments/brake/rollback", &[(200, in_cloud(6))]);
+    let text = user.fails(4, &["rollback", "brake", "--fleet"]);
+    assert!(text.contains("car-7: it has no fallback"), "{text}");
+    user.cloud.answers("DELETE /v1/deployments/brake", &[(204, json!(null))]);
+    user.cloud.answers("GET /v1/vehicles/car-7/status", &[ended(&[])]);
+    assert!(user.done(&["remove", "brake", "--fleet"]).contains("is removed on 1 vehicle"));
+    let text = user.fails(2, &["stop", "other", "--fleet"]);
+    assert!(text.contains("the cloud has no deployment `other`"), "{text}");
+}
+
+/// The deployment in the cloud, with waves in this state.
+fn in_waves(release: u64, wave: u64, state: &str, reason: &str) -> Value {
+    let mut deployment = in_cloud(release);
+    deployment["waves"] = json!({
+        "plan": {
+            "shares": [5, 50], "success": 90, "failures": 5, "soak_s": 600, "deadline_s": 86_400,
+            "on_failure": "pause",
+        },
+        "wave": wave, "waves": 3, "state": state, "reason": reason, "since": 1, "vehicles": 4,
+        "running": 3, "failed": 1,
+    });
+    deployment
+}
+
+#[test]
+fn a_deployment_in_waves_sends_its_plan_and_can_be_watched() {
+    let user = CloudUser::with_lambda();
+    let deployments = |all: &[Value]| {
+        let answers = all.iter().map(|it| (200, list(json!([it])))).collect::<Vec<_>>();
+        user.cloud.answers("GET /v1/deployments", &answers);
+    };
+    let waves = ["--wave", "5%", "--canary", "50", "--success", "90%"];
+    let deploy = [&DEPLOY[..], &waves].concat();
+    deployments(&[in_cloud(6), in_waves(7, 1, "running", "")]);
+    let text = user.done(&deploy);
+    let expected = "wave 1 of 3; it runs on 3 of 4 vehicles, and 1 failed\n\
+                    the next wave opens after 10min once 90 % run it: `gleaner fleet` shows them\n";
+    assert!(text.ends_with(expected), "{text}");
+    let seen = user.cloud.seen();
+    let sent = seen.iter().rfind(|it| it.line == "POST /v1/deployments").unwrap();
+    let sent: Value = serde_json::from_slice(&sent.body).unwrap();
+    assert_eq!(sent["waves"], in_waves(7, 1, "", "")["waves"]["plan"]);
+    // Watched, it waits for the last wave, and then for all vehicles.
+    let watch = [&deploy[..], &["--watch"]].concat();
+    user.vehicles(&[("car-7", "online", json!({}))]);
+    user.statuses("car-7", &[on_vehicle(7, "running")]);
+    deployments(&[in_cloud(6), in_waves(7, 2, "running", ""), in_cloud(7)]);
+    let text = user.done(&watch);
+    assert!(
+        text.contains("wave 2 of 3") && text.ends_with("`brake` runs on 1 vehicle\n"),
+        "{text}"
+    );
+    deployments(&[in_cloud(6), in_waves(7, 1, "paused", "wave 1: it failed on 1 of 4 vehicles")]);
+    let text = user.fails(4, &watch);
+    assert!(text.contains("wave 1 of 3, paused: wave 1: it failed on 1 of 4 vehicles"), "{text}");
+    assert!(text.contains("gleaner fleet resume ID"), "{text}");
+    deployments(&[in_cloud(6), in_cloud(8)]);
+    let text = user.fails(4, &watch);
+    assert!(text.contains("release 7 of `brake` was replaced or removed meanwhile"), "{text}");
+    for (options, reason) in
+        [(&["--success", "90%"][..], "--wave"), (&["--wave", "101%"], "`101%` is no share")]
+    {
+        let text = programs::output(&mut user.command(&[&DEPLOY[..], options].concat()));
+        assert_eq!(text.status.code(), Some(2));
+        let text = String::from_utf8(text.stderr).unwrap();
+        assert!(text.contains(reason), "{text}");
+    }
+}
+
+#[test]
+fn waves_are_listed_paused_resumed_and_aborted() {
+    let user = CloudUser::logged_in();
+    let paused = in_waves(6, 2, "paused", "paused by ada");
+    let line =
+        "brake: wave 2 of 3, paused: paused by ada; it runs on 3 of 4 vehicles, and 1 failed\n";
+    user.cloud.answers("GET /v1/deployments", &[(200, list(json!([paused])))]);
+    assert!(user.done(&["fleet"]).ends_with(line));
+    for change in ["pause", "resume", "abort"] {
+        let request = format!("POST /v1/deployments/brake/{change}");
+        user.cloud.answers(&request, &[(200, paused.clone())]);
+        assert_eq!(user.done(&["fleet", change, "brake"]), line);
+    }
+}

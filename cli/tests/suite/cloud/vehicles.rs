@@ -1,0 +1,135 @@
+//! `vehicles`, `enrol`, `unenrol`, and the commands with `--on`.
+
+use std::fs;
+use std::os::unix::fs::PermissionsExt;
+
+use serde_json::{Value, json};
+
+use super::fake::{FakeServer, problem};
+use super::{CloudUser, fails};
+use crate::programs;
+
+/// Returns a status of a vehicle with these deployments.
+pub fn status(deployments: &[Value]) -> Value {
+    json!({
+        "vehicle": "car-7", "key": "k", "labels": {}, "generation": 1, "capacity": [],
+        "orchestrator": { "version": "1", "pid": 1, "up_s": 1.0, "rss_bytes": 1, "cpu_s": 1.0 },
+        "deployments": deployments,
+    })
+}
+
+#[test]
+fn vehicles_are_listed_enrolled_once_and_revoked() {
+    let user = CloudUser::logged_in();
+    let vehicles = json!([{
+        "name": "car-7", "labels": {}, "state": "invited", "seen": null, "version": null,
+        "wanted": 1, "handled": 0, "problems": ["no trust root"], "running": 0, "deployments": 0,
+    }]);
+    user.cloud.answers("GET /v1/vehicles", &[(200, json!({ "items": vehicles }))]);
+    assert!(user.done(&["vehicles"]).ends_with("car-7: no trust root\n"));
+    assert_eq!(user.json(&["vehicles"]), vehicles);
+    let enrolment = json!({
+        "gleaner_enrolment": 1, "address": "127.0.0.1:8443", "vehicle": "car-7",
+        "authority": "PEM", "token": "secret",
+    });
+    user.cloud.answers("POST /v1/vehicles", &[(200, enrolment.clone())]);
+    let enrol = ["vehicles", "enrol", "car-7", "--to", "car-7.json"];
+    let text = user.done(&enrol);
+    assert!(text.contains("gleaner enrol car-7.json") && !text.contains("secret"), "{text}");
+    let file = user.path("car-7.json");
+    assert_eq!(fs::metadata(&file).unwrap().permissions().mode() & 0o777, 0o600);
+    let written: Value = serde_json::from_slice(&fs::read(&file).unwrap()).unwrap();
+    assert_eq!(written, enrolment);
+    user.cloud.seen();
+    assert!(user.fails(2, &enrol).contains("`car-7.json` exists"));
+    assert!(user.fails(2, &["vehicles", "enrol", "car-7", "--to", "no/file"]).contains("folder"));
+    assert!(user.cloud.seen().is_empty(), "the secret of a second enrolment is lost");
+    user.cloud.answers("DELETE /v1/vehicles/car-7", &[(204, json!(null))]);
+    assert!(user.done(&["vehicles", "revoke", "car-7"]).starts_with("revoked car-7"));
+}
+
+#[test]
+fn a_vehicle_is_seen_by_way_of_the_cloud() {
+    let user = CloudUser::logged_in();
+    user.cloud.answers("GET /v1/vehicles/car-7/status", &[(200, status(&[]))]);
+    assert!(user.done(&["status", "--on", "car-7"]).starts_with("car-7"));
+    assert_eq!(user.json(&["status", "--on", "car-7"])["vehicle"], "car-7");
+    assert!(user.done(&["top", "--once", "--on", "car-7"]).contains("car-7"));
+    let line = json!({
+        "stream": "lambdas/brake", "seq": 1, "time_ns": 1, "boot_ns": 1, "boot": "b",
+        "kind": "log", "record": { "level": "info", "message": "hello" },
+    });
+    let lines = json!(format!("{line}\n{line}\n"));
+    let records = "/v1/vehicles/car-7/lambdas/brake/records?last=2&follow=false";
+    user.cloud.answers(&format!("GET {records}"), &[(200, lines.clone())]);
+    let text = user.done(&["logs", "brake", "--on", "car-7", "-n", "2"]);
+    assert_eq!(text.matches("info: hello").count(), 2, "{text}");
+    let events = "GET /v1/vehicles/car-7/events?last=100&follow=false";
+    user.cloud.answers(events, &[(200, lines)]);
+    assert_eq!(user.json_lines(&["events", "--on", "car-7"]), [line.clone(), line]);
+    let text = user.fails(2, &["status", "--on", "car-8"]);
+    assert!(text.contains("no answer to GET /v1/vehicles/car-8/status"), "{text}");
+    for bad in [&["status", "--on", "../users"][..], &["status", "--on", "a", "--run-dir", "b"]] {
+        assert_eq!(programs::output(&mut user.command(bad)).status.code(), Some(2));
+    }
+}
+
+#[test]
+fn a_vehicle_is_enrolled_once_its_cloud_has_connected() {
+    let user = CloudUser::new();
+    let vehicle = FakeServer::on_socket(&user.path("control.sock"));
+    let text = json!({
+        "gleaner_enrolment": 1, "address": "10.0.0.1:8443", "vehicle": "car-7",
+        "authority": "PEM", "token": "secret",
+    });
+    fs::write(user.path("car-7.json"), text.to_string()).unwrap();
+    let with = |address: &str, state: &str, reason: Option<&str>| {
+        let mut status = status(&[]);
+        status["cloud"] = json!({
+            "address": address, "state": state, "reason": reason, "since_s": 3.0, "generation": 1,
+            "unsent": 12, "certificate_expires": 4102444800_u64,
+        });
+        (200, status)
+    };
+    let command = |arguments: &[&str]| {
+        let mut command = user.command(arguments);
+        command.env("GLEANER_RUN", user.folder.path());
+        command
+    };
+    vehicle.answers("PUT /v1/cloud", &[(200, json!(null))]);
+    let connected = with("10.0.0.1:8443", "connected", None);
+    let former = with("10.0.0.9:8443", "connected", None);
+    let connecting = with("10.0.0.1:8443", "connecting", Some("no route"));
+    vehicle.answers("GET /v1/status", &[(200, status(&[])), former, connecting.clone(), connected]);
+    let output = programs::output(&mut command(&["enrol", "car-7.json"]));
+    let shown = String::from_utf8_lossy(&output.stdout).into_owned();
+    let expected = "cloud 10.0.0.1:8443 connected for 3s; 12 records not sent, \
+                    certificate until 2100-01-01T00:00:00Z\n";
+    assert_eq!(shown, expected, "{}", String::from_utf8_lossy(&output.stderr));
+    let seen = vehicle.seen();
+    assert_eq!(seen[0].body, text.to_string().into_bytes());
+    assert_eq!(seen.len(), 5, "{seen:?}");
+    vehicle.answers("GET /v1/status", &[connecting]);
+    let text = fails(command(&["enrol", "car-7.json", "--timeout", "1ms"]), 4);
+    assert!(text.contains("after 1ms") && text.contains("cause: no route"), "{text}");
+    let refused = with("10.0.0.1:8443", "refused", Some("the token was used"));
+    vehicle.answers("GET /v1/status", &[refused]);
+    let text = fails(command(&["enrol", "car-7.json"]), 3);
+    assert!(text.contains("cause: the token was used"), "{text}");
+    let output = programs::output(&mut command(&["status"]));
+    assert!(String::from_utf8_lossy(&output.stdout).contains("refused for 3s: the token was used"));
+    vehicle.answers("PUT /v1/cloud", &[(400, problem(2, "it is for car-8"))]);
+    assert!(fails(command(&["enrol", "car-7.json"]), 2).contains("it is for car-8"));
+    fs::write(user.path("bad.json"), "{}").unwrap();
+    assert!(fails(command(&["enrol", "bad.json"]), 2).contains("this is no enrolment"));
+    vehicle.answers("DELETE /v1/cloud", &[(200, json!(null))]);
+    programs::done(&mut command(&["unenrol"]));
+}
+
+impl CloudUser {
+    #[track_caller]
+    fn json_lines(&self, arguments: &[&str]) -> Vec<Value> {
+        let text = self.done(&[arguments, &["--json"]].concat());
+        text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+    }
+}

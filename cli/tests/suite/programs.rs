@@ -1,0 +1,37 @@
+//! Starts programs, and writes scripts that take the place of programs.
+
+use std::fs;
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+use std::process::{Child, Command, Output, Stdio};
+use std::sync::{Mutex, PoisonError};
+
+/// Linux refuses to start a file that is open for writing anywhere, such as in a child that another
+/// test is about to start. The lock serialises writing and starting programs.
+static EXEC_LOCK: Mutex<()> = Mutex::new(());
+
+/// Writes a script that can be started.
+pub fn script(path: &Path, text: &str) {
+    let _lock = EXEC_LOCK.lock().unwrap_or_else(PoisonError::into_inner);
+    fs::write(path, text).unwrap();
+    fs::set_permissions(path, fs::Permissions::from_mode(0o755)).unwrap();
+}
+
+/// Starts a program.
+pub fn start(command: &mut Command) -> Child {
+    let _lock = EXEC_LOCK.lock().unwrap_or_else(PoisonError::into_inner);
+    command.spawn().unwrap()
+}
+
+/// Runs a program, and returns its output.
+pub fn output(command: &mut Command) -> Output {
+    start(command.stdout(Stdio::piped()).stderr(Stdio::piped())).wait_with_output().unwrap()
+}
+
+/// Runs a program that must succeed, and returns its standard output.
+#[track_caller]
+pub fn done(command: &mut Command) -> String {
+    let Output { status, stdout, stderr } = output(command);
+    assert!(status.success(), "{}", String::from_utf8_lossy(&stderr));
+    String::from_utf8(stdout).unwrap()
+}
