@@ -21,8 +21,8 @@ pub const LINES: &[(&str, usize, usize)] = &[
     ("player", 2233, 793),
     ("report", 2796, 928),
     ("rules", 2706, 1191),
-    ("tests", 6080, 12203),
-    ("xtask", 6780, 594),
+    ("tests", 6040, 12210),
+    ("xtask", 6800, 600),
 ];
 
 /// Files with functions of more than 80 lines, each with its reason.

@@ -47,8 +47,8 @@ impl DemoOptions {
 }
 
 /// Shows first what needs the fewest programs: the drive, then a vehicle, with a cloud unless
-/// `--no-fleet` is given. The first failure is the exit code, and does not skip what follows. Unless
-/// `--no-wait` is given, the page of the cloud is open until Ctrl-C.
+/// `--no-fleet` is given. The first failure is the exit code, and does not skip what follows.
+/// Unless `--no-wait` is given, the page of the cloud is open until Ctrl-C.
 pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
     let options = DemoOptions::parse(arguments).ok_or_else(|| {
         let message = "`cargo xtask demo` takes `--no-fleet`, `--no-wait`, both or nothing";

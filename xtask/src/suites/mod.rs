@@ -34,7 +34,7 @@ const LINTED: &str = "gleaner-fuzz/programs";
 
 /// Test programs that receive samples in real time, or kill processes at chosen moments: none runs
 /// beside another of them. `.config/nextest.toml` has the same list.
-const REAL_TIME: [&str; 5] = ["attacks", "dds", "kills", "live", "vehicle"];
+const REAL_TIME: [&str; 4] = ["dds", "kills", "live", "vehicle"];
 
 /// Number of suites that run at a time. Most tests wait for processes and clocks.
 const AT_A_TIME: usize = 2;
