@@ -281,7 +281,16 @@ fn suites(checkout: &Checkout) -> Result<Vec<Suite>, Failure> {
 fn pytest(checkout: &Checkout, name: &str, folders: &[&str]) -> Suite {
     let results = checkout.target().join(format!("pytest/{name}.xml"));
     let mut pytest = checkout.command(checkout.python());
-    pytest.args(["-m", "pytest", "-q", "-p", "no:cacheprovider", "--junit-xml"]);
+    pytest.args([
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "-p",
+        "no:logging",
+        "--junit-xml",
+    ]);
     pytest
         .arg(&results)
         .args(folders)
