@@ -299,11 +299,11 @@ fn folder(name: &str) -> String {
 
 /// Path of a clip, relative to the checkout: as it came from the cloud, if there is one.
 fn clip_path(vehicle: &DemoVehicle, clip: &Clip) -> String {
-    let name = clip.file.file_name().unwrap_or_default().display();
     if vehicle.has_cloud {
-        file(&format!("cloud-clips/{NAME}/{name}"))
+        let name = clip.file.file_name().unwrap_or_default();
+        file(&format!("cloud-clips/{NAME}/{}", name.display()))
     } else {
-        file(&format!("state/clips/{name}"))
+        file(&format!("state/clips/{}", clip.file.display()))
     }
 }
 
