@@ -22,7 +22,7 @@ pub const LINES: &[(&str, usize, usize)] = &[
     ("report", 2796, 928),
     ("rules", 2706, 1191),
     ("tests", 6070, 12210),
-    ("xtask", 6800, 600),
+    ("xtask", 6830, 600),
 ];
 
 /// Files with functions of more than 80 lines, each with its reason.

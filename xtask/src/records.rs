@@ -33,6 +33,9 @@ struct HeavyPart {
     counted: (&'static str, &'static str),
 }
 
+/// The part that builds test programs on other DDS implementations.
+const PEERS: &str = "peers, on Cyclone DDS and Fast DDS";
+
 const HEAVY: [HeavyPart; 7] = [
     HeavyPart {
         name: "lints: gleaner-host for fewer kinds of lambdas",
@@ -42,7 +45,7 @@ const HEAVY: [HeavyPart; 7] = [
         counted: ("kinds checked", "Finished "),
     },
     HeavyPart {
-        name: "peers, on Cyclone DDS and Fast DDS",
+        name: PEERS,
         packages: &["gleaner-tests"],
         has_programs: true,
         files: &["xtask/src/peers.rs", "examples", "tests/lambdas", "guest-sdk-python/gleaner"],
@@ -94,8 +97,9 @@ const HEAVY: [HeavyPart; 7] = [
 /// Files and folders on which every part depends.
 const COMMON: [&str; 4] = [".cargo/config.toml", "Cargo.lock", "Cargo.toml", "wit"];
 
-/// Tests of the source itself, on which no part depends.
-const HOUSE: [&str; 2] = ["tests/src/house", "tests/tests/house"];
+/// Tests of the source itself and their lists, on which no part depends.
+const HOUSE: [&str; 4] =
+    ["tests/src/budgets.rs", "tests/src/rooms.rs", "tests/src/words.rs", "tests/tests/house"];
 
 /// The record of a part.
 #[derive(Debug, Serialize, Deserialize)]
@@ -123,22 +127,46 @@ pub(crate) fn full(checkout: &Checkout) -> Result<Exit, Failure> {
     let results = checkout.target().join("full");
     fs::create_dir_all(&results).map_err(|error| cannot("make", &results, &error))?;
     let mut run = checkout.script(".ci/run");
-    steps::run(run.arg("--full").arg(&results), "see the first error above; no record is written")?;
+    let ended = steps::run(
+        run.arg("--full").arg(&results),
+        "see the first error above; parts that ended before it are recorded",
+    );
+    write(checkout, &results, commit.trim(), ended.is_ok())?;
+    ended.map(|()| Exit::Ok)
+}
+
+/// Writes the records of the parts in `results`; those of other parts stay. After a run that
+/// failed, that of the peers stays, too, as the last part of the run has their tests.
+fn write(
+    checkout: &Checkout,
+    results: &Path,
+    commit: &str,
+    has_passed: bool,
+) -> Result<(), Failure> {
     let sources = CheckoutSources::read(checkout)?;
-    let mut records = PartRecords::new();
-    for part in &HEAVY {
-        let (seconds, cpu_seconds, result) = part.result(&results)?;
+    let mut records = read(checkout)?;
+    for part in HEAVY.iter().filter(|part| has_passed || part.name != PEERS) {
+        let Some((seconds, cpu_seconds, result)) = part.result(results)? else { continue };
         let digest = sources.digest(checkout, part)?;
-        let commit = commit.trim().to_owned();
-        records
-            .insert(part.name.to_owned(), Record { digest, commit, seconds, cpu_seconds, result });
+        let commit = commit.to_owned();
+        let record = Record { digest, commit, seconds, cpu_seconds, result };
+        records.insert(part.name.to_owned(), record);
     }
     let json = serde_json::to_string_pretty(&records)
         .map_err(|error| Failure::caused_by(Exit::Internal, "cannot write records", &error))?;
     let file = checkout.path(FILE);
     fs::write(&file, json + "\n").map_err(|error| cannot("write", &file, &error))?;
     println!("wrote {FILE}; commit it");
-    Ok(Exit::Ok)
+    Ok(())
+}
+
+fn read(checkout: &Checkout) -> Result<PartRecords, Failure> {
+    let file = checkout.path(FILE);
+    match fs::read_to_string(&file) {
+        Ok(text) => serde_json::from_str(&text).map_err(|error| cannot("read", &file, &error)),
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(PartRecords::new()),
+        Err(error) => Err(cannot("read", &file, &error)),
+    }
 }
 
 /// Prints the record of a part as a row of the table of `.ci/run`, if its sources are the same as
@@ -148,12 +176,7 @@ pub(crate) fn print(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit,
     let Some(part) = HEAVY.iter().find(|part| part.name == name) else {
         return Err(Failure::new(Exit::Usage, format!("there is no heavy part `{name}`")));
     };
-    let file = checkout.path(FILE);
-    let records: PartRecords = match fs::read_to_string(&file) {
-        Ok(text) => serde_json::from_str(&text).map_err(|error| cannot("read", &file, &error))?,
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => PartRecords::new(),
-        Err(error) => return Err(cannot("read", &file, &error)),
-    };
+    let records = read(checkout)?;
     let Some(record) = records.get(name) else {
         eprintln!("`{name}` has no record in {FILE}");
         return Ok(Exit::Differs);
@@ -168,28 +191,26 @@ pub(crate) fn print(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit,
 }
 
 impl HeavyPart {
-    /// The seconds, CPU seconds and counts of this part in a run whose results are in `folder`.
-    fn result(&self, folder: &Path) -> Result<(u64, u64, String), Failure> {
-        let missing = || {
-            Failure::new(Exit::Internal, format!("`.ci/run` has not run `{}`", self.name))
-                .with_help("it has to run every part; see the messages above")
-        };
+    /// The seconds, CPU seconds and counts of this part in a run whose results are in `folder`;
+    /// `None` if the run ended before it.
+    fn result(&self, folder: &Path) -> Result<Option<(u64, u64, String)>, Failure> {
         let [table, output] = ["parts", self.name].map(|name| folder.join(name));
         let table = fs::read_to_string(&table).map_err(|error| cannot("read", &table, &error))?;
         // Another part may have a longer name that begins alike.
         let mut rows = table.lines().filter_map(|row| row.strip_prefix(self.name));
-        let row = rows.find(|rest| rest.starts_with(' ')).ok_or_else(missing)?;
+        let Some(row) = rows.find(|rest| rest.starts_with(' ')) else { return Ok(None) };
         let mut numbers = row.split_whitespace().filter_map(|number| number.parse().ok());
         let (Some(seconds), Some(cpu_seconds)) = (numbers.next(), numbers.next()) else {
-            return Err(missing());
+            return Err(Failure::new(Exit::Internal, format!("no seconds in `{row}`")));
         };
         let text = fs::read_to_string(&output).map_err(|error| cannot("read", &output, &error))?;
         let (unit, sign) = self.counted;
         let count = text.lines().filter(|line| line.contains(sign)).count();
         if count == 0 {
-            return Err(missing());
+            let message = format!("`{}` ended, and has no {unit}", output.display());
+            return Err(Failure::new(Exit::Internal, message));
         }
-        Ok((seconds, cpu_seconds, format!("{count} {unit}")))
+        Ok(Some((seconds, cpu_seconds, format!("{count} {unit}"))))
     }
 }
 

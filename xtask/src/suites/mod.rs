@@ -32,8 +32,8 @@ use counts::{LibtestParser, TestCounts};
 /// Features with which `.ci/run` checks the workspace.
 const LINTED: &str = "gleaner-fuzz/programs";
 
-/// Test programs that receive samples in real time, or kill processes at chosen moments: none runs
-/// beside another of them. `.config/nextest.toml` has the same list.
+/// Test programs that receive samples in real time, or kill processes at chosen moments: without
+/// nextest, none runs beside another of them. With it, `.config/nextest.toml` limits them.
 const REAL_TIME: [&str; 4] = ["dds", "kills", "live", "vehicle"];
 
 /// Number of suites that run at a time. Most tests wait for processes and clocks.
@@ -393,7 +393,7 @@ impl SuiteResults {
             SuiteResults::JUnit(_) => {
                 let skipped = line.trim_start().strip_prefix("SKIP [");
                 if let Some((_, name)) = skipped.and_then(|rest| rest.split_once(") ")) {
-                    let (name, reason) = name.split_once(" [").unwrap_or((name, "ignored"));
+                    let (name, reason) = name.rsplit_once(" [").unwrap_or((name, "ignored"));
                     parser.counts.skip(name, reason.trim_end_matches(']'));
                 }
             }
