@@ -23,7 +23,7 @@ fn tests_that_read_shared_data_are_run_again_without_it() {
     // Included as a module, or read directly.
     let signs =
         [["shared_", "data.rs\"]"], ["var_os(\"GLEANER_", "SHARED\")"]].map(|it| it.concat());
-    let mut packages = 0;
+    let mut readers = 0;
     for file in &files {
         let is_reader =
             file.is_one_of(&["rs"]) && signs.iter().any(|sign| file.text.contains(sign));
@@ -39,7 +39,7 @@ fn tests_that_read_shared_data_are_run_again_without_it() {
             "`{name}` is not in READ_SHARED, and reads it in {}",
             file.path
         );
-        packages += 1;
+        readers += 1;
     }
-    assert_eq!(packages, 4, "the search finds other files than before");
+    assert_eq!(readers, 4, "the search finds other files than before");
 }

@@ -393,8 +393,9 @@ impl SuiteResults {
             SuiteResults::JUnit(_) => {
                 let skipped = line.trim_start().strip_prefix("SKIP [");
                 if let Some((_, name)) = skipped.and_then(|rest| rest.split_once(") ")) {
-                    let (name, reason) = name.rsplit_once(" [").unwrap_or((name, "ignored"));
-                    parser.counts.skip(name, reason.trim_end_matches(']'));
+                    let reason = name.strip_suffix(']').and_then(|name| name.rsplit_once(" ["));
+                    let (name, reason) = reason.unwrap_or((name, "ignored"));
+                    parser.counts.skip(name, reason);
                 }
             }
             SuiteResults::Status => {}
