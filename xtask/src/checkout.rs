@@ -32,7 +32,7 @@ impl Checkout {
             .ok_or_else(|| lost("cannot find the checkout"))?
             .to_owned();
         let cargo = env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
-        // This program is TARGET/xtask/xtask. Every other cargo builds there, too, whatever the
+        // This program is TARGET/release/xtask. Every other cargo builds there, too, whatever the
         // user has configured.
         let exe = env::current_exe().ok().filter(|exe| exe.is_absolute());
         let target = exe.as_deref().and_then(|exe| exe.ancestors().nth(2));
