@@ -139,7 +139,9 @@ fn arguments(args: &ReplayArgs) -> Vec<OsString> {
     line.extend(
         args.topics.iter().flat_map(|pattern| [OsString::from("--topics"), pattern.into()]),
     );
-    for (flag, wanted) in [("--all", args.all), ("--no-record", args.no_record)] {
+    for (flag, wanted) in
+        [("--merge", args.merge), ("--all", args.all), ("--no-record", args.no_record)]
+    {
         if wanted {
             line.push(flag.into());
         }
@@ -167,6 +169,7 @@ mod tests {
             drives: vec!["a.mcap".into(), "b".into()],
             from: Some("12.5".to_owned()),
             to: Some("@7".to_owned()),
+            merge: true,
             out: Some("out".into()),
             all: true,
             no_record: true,
@@ -178,7 +181,7 @@ mod tests {
         };
         let line =
             "replay --set x=-1 --remap /a:=/b --vehicle v.toml --out out --journal j --from 12.5 \
-             --to @7 --topics * --topics /a --all --no-record -- -dir a.mcap b"
+             --to @7 --topics * --topics /a --merge --all --no-record -- -dir a.mcap b"
                 .split(' ');
         assert_eq!(arguments(&args), line.collect::<Vec<_>>());
     }

@@ -111,7 +111,9 @@ pub(crate) fn replay(paths: &[PathBuf], peeking: bool) -> (usize, u64, String) {
         assert_eq!(replay.progress().done, steps as u64);
         order.note(&step);
         let (meta, crc) = sink.last();
-        assert_eq!((meta, sink.bytes()), (Some(step.meta), step.bytes as u64), "step and sink");
+        if step.delivery != Delivery::Malformed {
+            assert_eq!((meta, sink.bytes()), (Some(step.meta), step.bytes as u64), "step and sink");
+        }
         digest = digest_of(digest, &step, crc);
         if steps >= STEPS_MAX {
             return (steps, digest, "too many steps".to_owned());

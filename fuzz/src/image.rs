@@ -4,7 +4,8 @@
 //! and its pixels.
 
 use gleaner_image::{
-    Encoding, ImageError, MAX_SIDE, PixelError, Roi, View, decode_rgb8, ops, probe,
+    Encoding, ImageError, MAX_SIDE, PixelError, Roi, StopCheck, View, decode, ops, probe,
+    probe_message,
 };
 
 use crate::budget;
@@ -52,23 +53,28 @@ pub fn check(data: &[u8]) -> bool {
 }
 
 fn file(data: &[u8]) -> bool {
+    for format in ["", "16UC1; compressedDepth png"] {
+        let _ = budget::within(64 << 10, || probe_message(format, data).map(drop));
+    }
     let Ok(header) = budget::within(64 << 10, || probe(data)) else { return false };
     let sides = 1..=MAX_SIDE;
     assert!(sides.contains(&header.width) && sides.contains(&header.height), "{header}");
     let len = header.rgb8_len().expect("this machine counts in 64 bits");
     assert_eq!(len as u64, 3 * u64::from(header.width) * u64::from(header.height));
+    let to = |out: &mut [u8]| decode(data, &header, DECODED_MAX, out, &StopCheck::new(&|| true));
     if len > DECODED_MAX {
-        let refused = budget::within(64 << 10, || decode_rgb8(data, &header, DECODED_MAX, &mut []));
+        let refused = budget::within(64 << 10, || to(&mut []));
         assert!(matches!(refused, Err(ImageError::Bomb { .. })), "{refused:?}");
         return false;
     }
     // The documented bound, plus small allocations.
     let memory = (4 << 20) + 4 * DECODED_MAX + 2 * data.len() + (256 << 10);
-    let decode = |before: u8| {
+    let len = header.decoded_len().expect("as above");
+    let decoded = |before: u8| {
         let mut out = vec![before; len];
-        budget::within(memory, || decode_rgb8(data, &header, DECODED_MAX, &mut out)).map(|()| out)
+        budget::within(memory, || to(&mut out)).map(|()| out)
     };
-    let (first, second) = (decode(0xaa), decode(0x55));
+    let (first, second) = (decoded(0xaa), decoded(0x55));
     let valid = first.is_ok();
     match (first, second) {
         (Ok(first), Ok(second)) => {
@@ -78,10 +84,7 @@ fn file(data: &[u8]) -> bool {
         (first, second) => panic!("{header}: {:?}, then {:?}", first.err(), second.err()),
     }
     let mut short = vec![0; len - 1];
-    assert!(matches!(
-        decode_rgb8(data, &header, DECODED_MAX, &mut short),
-        Err(ImageError::Pixels(PixelError::Output { .. }))
-    ));
+    assert!(matches!(to(&mut short), Err(ImageError::Pixels(PixelError::Output { .. }))));
     valid
 }
 

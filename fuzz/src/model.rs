@@ -68,9 +68,11 @@ fn file(model: &[u8]) -> bool {
             return false;
         }
     };
-    let ModelSignature { inputs, outputs, operators } = &signature;
+    let ModelSignature { inputs, outputs, rten: _, metadata } = &signature;
     assert!(inputs.len() <= TENSORS_MAX && outputs.len() <= TENSORS_MAX);
-    assert!(operators.iter().map(String::len).sum::<usize>() <= model.len());
+    assert!(
+        metadata.iter().map(|(key, value)| key.len() + value.len()).sum::<usize>() <= model.len()
+    );
     assert!(outputs.iter().all(|output| output.has_shape || output.tensor.shape.is_empty()));
     let outputs: Vec<&TensorInfo> = outputs.iter().map(|output| &output.tensor).collect();
     for infos in [inputs.iter().collect(), outputs] {

@@ -277,17 +277,21 @@ class Sample(Protocol):
         """True if the message is big-endian CDR."""
 
     def cdr(self, offset: int = 0, len: int | None = None) -> bytes:
-        """Returns raw CDR bytes without the encapsulation header: at most ``len``, from ``offset``,
-        clamped to the message and to 1 MiB."""
+        """Returns raw CDR bytes without the encapsulation header: ``len`` from ``offset``, or all
+        from there; fewer only where the message ends.
+
+        Raises DataError: ``out-of-range`` for more than 1 MiB; read a longer message in pieces,
+        such as ``[cdr(at, 1 << 20) for at in range(0, size, 1 << 20)]``."""
 
     def as_frame(self) -> Frame:
         """Returns the message as an image. The type must be ``sensor_msgs/msg/Image`` or
-        ``sensor_msgs/msg/CompressedImage``. This call decodes a JPEG or PNG to rgb8, once for each
-        sample.
+        ``sensor_msgs/msg/CompressedImage``. This call decodes a JPEG or PNG to rgb8, and a grey PNG
+        of 16 bits (also ``16UC1; compressedDepth``) to mono16, once for each sample.
 
-        Raises DataError: ``not-a-frame``; ``no-room`` if the decoded image exceeds
-        ``decoded_size``, all slots for decoded images are held, or the lambda holds as many frames
-        as ``frames`` in ``[limits]`` allows; ``malformed``."""
+        Raises DataError: ``not-a-frame``, also for formats that are not decoded or contradict the
+        bytes, such as ``32FC1``, ``h264``, RVL and PNG of 16 bits with colour; ``no-room`` if the
+        decoded image exceeds ``decoded_size``, all slots for decoded images are held, or the lambda
+        holds as many frames as ``frames`` in ``[limits]`` allows; ``malformed``."""
 
 
 class Frame(Protocol):
@@ -327,21 +331,25 @@ class Frame(Protocol):
 
     def resize(self, width: int, height: int) -> Frame:
         """Creates a frame of ``width`` by ``height`` pixels, each side 1 to 16,384. Its encoding is
-        rgb8, or mono8 if this frame is grey. A new pixel is the mean of the area that it covers
+        rgb8, or mono8 if this frame is of mono8. A new pixel is the mean of the area that it covers
         where the frame shrinks, and a linear interpolation where it grows.
 
         Raises DataError: ``out-of-range``; ``no-room`` if the frames that the lambda created would
         together exceed ``memory`` in ``[limits]``, or the lambda holds as many frames as ``frames``
-        allows; ``not-a-frame`` for Bayer encodings."""
+        allows; ``not-a-frame`` for Bayer encodings, and for mono16, whose values would lose 8
+        bits."""
 
     def to_gray(self) -> Frame:
-        """Creates a mono8 frame of the same size.
+        """Creates a mono8 frame of the same size. Luma is rounded down; that of a 16-bit pixel is
+        its high byte.
 
         Raises DataError: ``no-room``, as :meth:`resize`; ``not-a-frame`` for Bayer encodings."""
 
     def read(self, offset: int = 0, len: int | None = None) -> bytes:
-        """Returns a copy of pixel bytes: at most ``len``, from ``offset``, clamped to the frame and
-        to 1 MiB. :meth:`array` needs no copy."""
+        """Returns a copy of pixel bytes: ``len`` from ``offset``, or all from there; fewer only
+        where the frame ends. :meth:`array` needs no copy, and has no limit.
+
+        Raises DataError: ``out-of-range`` for more than 1 MiB."""
 
     def array(self) -> npt.NDArray[Any]:
         """Returns the pixels as a read-only array, without a copy, whatever their size.

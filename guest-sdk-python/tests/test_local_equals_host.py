@@ -192,7 +192,7 @@ class Operations(unittest.TestCase):
             decisions = case.replay(PIXELS, images)
             found.append([decision["triggers"] for decision in decisions])
         labels = [trigger["label"] for triggers in found[0] for trigger in triggers]
-        self.assertEqual((labels.count("resize"), labels.count("refused")), (7 * 9, 2))
+        self.assertEqual((labels.count("resize"), labels.count("refused")), (7 * 8, 3))
         for image, hosted, local in zip(images, *found):
             self.assertEqual(local, hosted, image.encoding)
 

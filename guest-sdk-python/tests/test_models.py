@@ -156,6 +156,38 @@ class Models(unittest.TestCase):
         with self.assertRaisesRegex(ReplayError, "no model `segments` for answers"):
             run(Unanswered, 1, {"segments": FakeModel()})
 
+    def test_a_wrong_answer_is_an_error_of_the_test_and_no_fault_of_the_lambda(self) -> None:
+        class Calm(Lambda):
+            def on_event(self, ctx: Context, event: Sample) -> None:
+                try:
+                    self.model.detect(event.as_frame())
+                    self.model.run({})
+                except Exception:
+                    ctx.log("warn", "goes on")
+
+        def cause(**answers: Any) -> str:
+            with self.assertRaises(ReplayError) as raised:
+                run(Calm, 1, {"detector": FakeModel(**{"detect": lambda _: [], **answers})})
+            what, why, _ = str(raised.exception).splitlines()
+            self.assertRegex(what, "the test's answer of `.*` for model `detector` is wrong")
+            return why
+
+        listed, strange = [0, "person", 0.9, 4, 8, 2, 5], {"boxes": np.zeros(1, np.complex64)}
+        for answer, why in (
+            (None, "None is not a list"),
+            ([listed], f"{listed} is not a Detection"),
+            ([box(0, "person", 1.5)], f"{box(0, 'person', 1.5)} is not a Detection"),
+            ([box(0, "person", 0.5)._replace(width=0)], "Detection(class_=0, label='person'"),
+        ):
+            self.assertIn(why, cause(detect=lambda frame, answer=answer: answer))
+        self.assertIn("[] is not a dict", cause(run=lambda inputs: []))
+        self.assertIn("`boxes` is of complex64", cause(run=lambda inputs: strange))
+        # An error in the code of the test is raised as it is.
+        with self.assertRaises(ZeroDivisionError):
+            run(Calm, 1, {"detector": FakeModel(lambda frame: [box(1 // 0, "", 1)])})
+        with self.assertRaisesRegex(ReplayError, "answers of model `detector` are not a FakeModel"):
+            run(Calm, 1, {"detector": lambda frame: []})  # type: ignore[dict-item]
+
     def test_frames_that_no_model_accepts_are_refused(self) -> None:
         def fault(frame: Dict[str, Any], **keys: str) -> str:
             drive = {"/camera": {"t": [0], **frame}}

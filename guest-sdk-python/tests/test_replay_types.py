@@ -83,7 +83,7 @@ class Definitions(unittest.TestCase):
             replay(self.lambda_, self.folder / "bag")
         with self.assertRaisesRegex(
             ReplayError,
-            "there is no definition of `car/msg/Wheel`\n.*`car/msg/Wheels` refers to it",
+            "there is no definition of `car/msg/Wheel`, to which `car/msg/Wheels` refers",
         ):
             replay(self.lambda_, self.folder / "bag", types={WHEELS: OF_WHEELS})
         types = {WHEELS: OF_WHEELS, "car/msg/Wheel": OF_WHEEL}
@@ -114,6 +114,18 @@ class Definitions(unittest.TestCase):
         bag(self.folder / "bag", 3.5, with_definitions=True)
         self.write({"msg/car/msg/Wheels.msg": "float32 other\n"})
         self.assertEqual(self.scores(self.folder / "bag", types={WHEELS: "string other\n"}), [3.5])
+
+    def test_a_definition_that_has_not_the_hash_of_the_topic_is_refused(self) -> None:
+        bag(self.folder / "bag", 3.5, with_definitions=True)
+        (file,) = (self.folder / "bag").glob("*.db3")
+        with contextlib.closing(sqlite3.connect(file)) as database, database:
+            database.execute(
+                "UPDATE message_definitions SET encoded_message_definition = 'float32 speed' "
+                "WHERE topic_type LIKE '%/Wheels'"
+            )
+        refused = f"cannot read topic `/wheels` of type `{WHEELS}`\n.*not the hash of the topic"
+        with self.assertRaisesRegex(ReplayError, refused):
+            replay(self.lambda_, self.folder / "bag")
 
     def test_definitions_of_the_lambda_take_precedence_over_ros_2(self) -> None:
         self.write(

@@ -1925,8 +1925,9 @@ pub mod gleaner {
       }
       impl Sample {
         #[allow(unused_unsafe, clippy::all)]
-        /// Returns raw CDR bytes without the encapsulation header: at most `len`, from `offset`,
-        /// clamped to the message and to 1 MiB.
+        /// Returns raw CDR bytes without the encapsulation header: `len` from `offset`, fewer only
+        /// where the message ends. A call that would return more than 1 MiB is a fault: read a
+        /// longer message in pieces.
         #[allow(async_fn_in_trait)]
         pub fn cdr(&self,offset: u64,len: u32,) -> _rt::Vec::<u8>{
           unsafe {
@@ -1955,12 +1956,13 @@ pub mod gleaner {
       impl Sample {
         #[allow(unused_unsafe, clippy::all)]
         /// Returns the message as an image. The type must be `sensor_msgs/msg/Image` or
-        /// `sensor_msgs/msg/CompressedImage`. This call decodes a JPEG or PNG to rgb8, once for
-        /// each sample.
+        /// `sensor_msgs/msg/CompressedImage`. This call decodes a JPEG or PNG to rgb8, and a grey
+        /// PNG of 16 bits (also `16UC1; compressedDepth`) to mono16, once for each sample.
         ///
-        /// Errors: `not-a-frame`; `no-room` if the decoded image exceeds `decoded_size`, all slots
-        /// for decoded images are held, or the lambda holds as many frames as `frames` in
-        /// `[limits]` allows; `malformed`.
+        /// Errors: `not-a-frame`, also for formats that are not decoded or contradict the bytes,
+        /// such as `32FC1`, `h264`, RVL and PNG of 16 bits with colour; `no-room` if the decoded
+        /// image exceeds `decoded_size`, all slots for decoded images are held, or the lambda holds
+        /// as many frames as `frames` in `[limits]` allows; `malformed`.
         #[allow(async_fn_in_trait)]
         pub fn as_frame(&self,) -> Result<Frame,DataError>{
           unsafe {
@@ -2450,12 +2452,12 @@ pub mod gleaner {
       impl Frame {
         #[allow(unused_unsafe, clippy::all)]
         /// Creates a frame of `width` by `height` pixels, each side 1 to 16,384. Its encoding is
-        /// rgb8, or mono8 if this frame is grey. A new pixel is the mean of the area that it covers
-        /// where the frame shrinks, and a linear interpolation where it grows.
+        /// rgb8, or mono8 if this frame is of mono8. A new pixel is the mean of the area that it
+        /// covers where the frame shrinks, and a linear interpolation where it grows.
         ///
         /// Errors: `out-of-range`; `no-room` if the frames that the lambda created would together
         /// exceed `memory` in `[limits]`, or the lambda holds as many frames as `frames` allows;
-        /// `not-a-frame` for Bayer encodings.
+        /// `not-a-frame` for Bayer encodings, and for mono16, whose values would lose 8 bits.
         #[allow(async_fn_in_trait)]
         pub fn resize(&self,width: u32,height: u32,) -> Result<Frame,DataError>{
           unsafe {
@@ -2571,7 +2573,8 @@ pub mod gleaner {
       }
       impl Frame {
         #[allow(unused_unsafe, clippy::all)]
-        /// Creates a mono8 frame of the same size.
+        /// Creates a mono8 frame of the same size. Luma is rounded down; that of a 16-bit pixel is
+        /// its high byte.
         ///
         /// Errors: `no-room`, as `resize`; `not-a-frame` for Bayer encodings.
         #[allow(async_fn_in_trait)]
@@ -2689,8 +2692,8 @@ pub mod gleaner {
       }
       impl Frame {
         #[allow(unused_unsafe, clippy::all)]
-        /// Returns pixel bytes: at most `len`, from `offset`, clamped to the frame and to 1 MiB.
-        /// Reading in pieces of 64 KiB is fastest.
+        /// Returns pixel bytes: `len` from `offset`, fewer only where the frame ends. A call that
+        /// would return more than 1 MiB is a fault. Reading in pieces of 64 KiB is fastest.
         #[allow(async_fn_in_trait)]
         pub fn read(&self,offset: u64,len: u32,) -> _rt::Vec::<u8>{
           unsafe {

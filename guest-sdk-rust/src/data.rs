@@ -178,21 +178,23 @@ impl Sample {
         self.0.big_endian()
     }
 
-    /// Returns raw CDR bytes without the encapsulation header: at most `len`, from `offset`,
-    /// clamped to the message and to 1 MiB.
+    /// Returns raw CDR bytes without the encapsulation header: `len` from `offset`, fewer only
+    /// where the message ends. A call that would return more than 1 MiB is a fault: read a longer
+    /// message in pieces.
     pub fn cdr(&self, offset: u64, len: u32) -> Vec<u8> {
         self.0.cdr(offset, len)
     }
 
     /// Returns the message as an image. The type must be `sensor_msgs/msg/Image` or
-    /// `sensor_msgs/msg/CompressedImage`. This call decodes a JPEG or PNG to rgb8, once for each
-    /// sample.
+    /// `sensor_msgs/msg/CompressedImage`. This call decodes a JPEG or PNG to rgb8, and a grey PNG
+    /// of 16 bits (also `16UC1; compressedDepth`) to mono16, once for each sample.
     ///
     /// # Errors
     ///
-    /// `not-a-frame`; `no-room` if the decoded image exceeds `decoded_size`, all slots for decoded
-    /// images are held, or the lambda holds as many frames as `frames` in `[limits]` allows;
-    /// `malformed`.
+    /// `not-a-frame`, also for formats that are not decoded or contradict the bytes, such as
+    /// `32FC1`, `h264`, RVL and PNG of 16 bits with colour; `no-room` if the decoded image exceeds
+    /// `decoded_size`, all slots for decoded images are held, or the lambda holds as many frames as
+    /// `frames` in `[limits]` allows; `malformed`.
     pub fn as_frame(&self) -> Result<Frame> {
         Ok(Frame(into_result(self.0.as_frame())?))
     }
@@ -236,19 +238,20 @@ impl Frame {
     }
 
     /// Creates a frame of `width` by `height` pixels, each side 1 to 16,384. Its encoding is rgb8,
-    /// or mono8 if this frame is grey. A new pixel is the mean of the area that it covers where the
-    /// frame shrinks, and a linear interpolation where it grows.
+    /// or mono8 if this frame is of mono8. A new pixel is the mean of the area that it covers where
+    /// the frame shrinks, and a linear interpolation where it grows.
     ///
     /// # Errors
     ///
     /// `out-of-range`; `no-room` if the frames that the lambda created would together exceed
     /// `memory` in `[limits]`, or the lambda holds as many frames as `frames` allows; `not-a-frame`
-    /// for Bayer encodings.
+    /// for Bayer encodings, and for mono16, whose values would lose 8 bits.
     pub fn resize(&self, width: u32, height: u32) -> Result<Frame> {
         Ok(Frame(into_result(self.0.resize(width, height))?))
     }
 
-    /// Creates a mono8 frame of the same size.
+    /// Creates a mono8 frame of the same size. Luma is rounded down; that of a 16-bit pixel is its
+    /// high byte.
     ///
     /// # Errors
     ///
@@ -257,8 +260,8 @@ impl Frame {
         Ok(Frame(into_result(self.0.to_gray())?))
     }
 
-    /// Returns pixel bytes: at most `len`, from `offset`, clamped to the frame and to 1 MiB.
-    /// Reading in pieces of 64 KiB is fastest.
+    /// Returns pixel bytes: `len` from `offset`, fewer only where the frame ends. A call that would
+    /// return more than 1 MiB is a fault. Reading in pieces of 64 KiB is fastest.
     pub fn read(&self, offset: u64, len: u32) -> Vec<u8> {
         self.0.read(offset, len)
     }

@@ -60,7 +60,7 @@ pub mod testing;
 pub mod trigger;
 
 pub use config::{Config, ConfigValue};
-pub use data::{Column, Field, Frame, Sample, Tick, Topic, input, inputs, now_ns};
+pub use data::{Column, Encoding, Field, Frame, Sample, Tick, Topic, input, inputs, now_ns};
 pub use error::{Error, Result};
 pub use inference::{DetectOptions, Detection, Model, Tensor};
 pub use lambda::Lambda;

@@ -240,6 +240,7 @@ impl RunSummary {
                     summary.backed_off,
                 );
                 counts.push(("messages out of order in the drive", summary.out_of_order));
+                counts.push(("malformed messages of the drive", summary.malformed.values().sum()));
                 counts.extend(by_cause(&summary.recording));
                 counts
             }

@@ -19,6 +19,7 @@ mod fleet;
 mod fuzz;
 mod glibc;
 mod metadata;
+mod models;
 mod page;
 mod peers;
 mod player;
@@ -59,6 +60,7 @@ const USAGE: &str = "usage: cargo xtask COMMAND
            packages first, --kills N kills its programs in turn under simulated vehicles
   peers    build test programs on other DDS implementations; --install fetches their packages first
   page     use the cloud's page in Chromium; --install fetches the browser's package first
+  models   run the tests of ONNX, and random graphs, on each backend that runs models
   player   fetch the tools for gleaner-player, which plays drives with Cyclone DDS, and build it
   fuzz     fuzz parsers of untrusted input; [TARGET...] [--seconds N] [--seed N]
   aarch64  build for ARM vehicles, and compare the decisions of lambdas there, emulated
@@ -114,6 +116,7 @@ fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
         "bench" => bench::run(&checkout, rest),
         "fleet" => fleet::run_scaled(&checkout, rest),
         "fuzz" => fuzz::run(&checkout, rest),
+        "models" => models::run(&checkout),
         "page" => page::run_flows(&checkout, rest),
         "peers" => peers::build(&checkout, rest),
         "player" => player::run(&checkout),

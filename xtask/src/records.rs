@@ -36,7 +36,7 @@ struct HeavyPart {
 /// The part that builds test programs on other DDS implementations.
 const PEERS: &str = "peers, on Cyclone DDS and Fast DDS";
 
-const HEAVY: [HeavyPart; 7] = [
+const HEAVY: [HeavyPart; 8] = [
     HeavyPart {
         name: "lints: gleaner-host for fewer kinds of lambdas",
         packages: &["gleaner-host"],
@@ -57,6 +57,13 @@ const HEAVY: [HeavyPart; 7] = [
         has_programs: false,
         files: &["xtask/src/page.rs"],
         counted: ("flows", "ok "),
+    },
+    HeavyPart {
+        name: "models, by the tests of ONNX",
+        packages: &["gleaner-inference"],
+        has_programs: false,
+        files: &["xtask/src/models.rs", "tests/models"],
+        counted: ("backends", " right "),
     },
     HeavyPart {
         name: "benches, quick",

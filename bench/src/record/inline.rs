@@ -141,6 +141,7 @@ fn subscribe(loopback: &mut Loopback, recorder: &Arc<Mutex<Recorder>>, name: &st
         type_name: type_name.to_owned(),
         definitions: None,
         offered_qos: None,
+        other_definitions: Vec::new(),
     };
     let topic = recorder.lock().expect("one thread").add_topic(topic).expect("few topics");
     let spec = TopicSpec {

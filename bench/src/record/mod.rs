@@ -119,7 +119,16 @@ impl Traffic {
             let (writer, endian) = (Guid::default(), Endian::Little);
             publish(
                 name,
-                &SampleMeta { at_ns, publish_ns: at_ns, writer, seq, endian, options: [0; 2] },
+                &SampleMeta {
+                    at_ns,
+                    publish_ns: at_ns,
+                    writer,
+                    seq,
+                    endian,
+                    options: [0; 2],
+                    layout: 0,
+                    is_latched: false,
+                },
                 cdr,
             );
         };

@@ -324,6 +324,9 @@ pub struct ReplayArgs {
     /// merged by time
     #[arg(value_name = "DRIVE", required = true)]
     pub drives: Vec<PathBuf>,
+    /// Merge drives that overlap in time and have a topic in common, which is refused otherwise
+    #[arg(long)]
+    pub merge: bool,
     /// Start at this time: seconds after the start of the drive, as in 12.5 or 2min, or since 1970,
     /// as in @1700000000.5
     #[arg(long, value_name = "TIME", value_parser = drive_time)]
@@ -396,6 +399,9 @@ pub struct DevArgs {
     /// MCAP files, rosbag2 .db3 files and directories; several are merged by time
     #[arg(value_name = "DRIVE", required = true)]
     pub drives: Vec<PathBuf>,
+    /// Merge drives that overlap in time and have a topic in common, which is refused otherwise
+    #[arg(long)]
+    pub merge: bool,
     /// Start at this time, as in `gleaner replay`
     #[arg(long, value_name = "TIME", value_parser = drive_time)]
     pub from: Option<String>,

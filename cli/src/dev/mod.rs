@@ -103,7 +103,7 @@ fn keep(out: &Path, before: &Path) -> bool {
 }
 
 fn replay_args(args: DevArgs) -> ReplayArgs {
-    let DevArgs { target, drives, from, to, out, no_record } = args;
+    let DevArgs { target, drives, merge, from, to, out, no_record } = args;
     ReplayArgs {
         target,
         drives,
@@ -115,6 +115,7 @@ fn replay_args(args: DevArgs) -> ReplayArgs {
         topics: Vec::new(),
         journal: None,
         verify: None,
+        merge,
         no_report: false,
         json: false,
     }

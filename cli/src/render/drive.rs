@@ -4,6 +4,7 @@ use std::collections::HashSet;
 use std::fmt::Write;
 
 use gleaner_base::visible;
+use gleaner_lambda::manifest::{TopicName, TypeName};
 use gleaner_protocol::{DriveInfo, DriveTopicInfo, PictureInfo};
 use gleaner_report::format::{counted, grouped, seconds, size};
 
@@ -13,14 +14,11 @@ use super::live::table;
 const EMPTY_WORDS: [&str; 7] =
     ["data", "raw", "image", "image_raw", "image_color", "compressed", "msg"];
 
-/// Help for a damaged drive.
-const COPY_AGAIN: &str = "copy the file again if you can";
-
 /// Formats the length of the drive, a table of its topics, and `[[input]]` tables.
 pub(crate) fn drive(drive: &DriveInfo) -> String {
     let (Some(start), Some(end)) = (drive.start_ns, drive.end_ns) else {
         return match &drive.damaged {
-            Some(damaged) => format!("no messages: {}; {COPY_AGAIN}\n", visible(damaged)),
+            Some(damaged) => format!("no messages: {}\n", visible(damaged)),
             None => "no messages\n".to_owned(),
         };
     };
@@ -36,7 +34,7 @@ pub(crate) fn drive(drive: &DriveInfo) -> String {
             writeln!(text, "rates, gaps and sizes are from {parts}; --all reads the whole drive");
     }
     if let Some(damaged) = &drive.damaged {
-        let _ = writeln!(text, "{}; {COPY_AGAIN}", visible(damaged));
+        let _ = writeln!(text, "{}", visible(damaged));
     }
     if drive.out_of_order > 0 {
         let _ =
@@ -58,6 +56,8 @@ fn row(topic: &DriveTopicInfo, start_ns: i64) -> [String; 9] {
         topic.picture.as_ref().map(picture_text),
         (!topic.is_defined).then(|| "no definition: read as bytes only".to_owned()),
         topic.unreadable.as_deref().map(visible),
+        (topic.layouts > 1).then(|| format!("{} layouts of its type", topic.layouts)),
+        (topic.malformed > 0).then(|| format!("{} malformed, left out", grouped(topic.malformed))),
     ];
     [
         visible(&topic.topic),
@@ -94,6 +94,7 @@ fn inputs(topics: &[DriveTopicInfo]) -> String {
     for topic in topics
         .iter()
         .filter(|topic| topic.is_defined && topic.unreadable.is_none() && topic.messages_read > 0)
+        .filter(|topic| topic.type_name.parse::<TypeName>().is_ok() && !topic.topic.is_empty())
     {
         let base = name_of(&topic.topic);
         let others = (2..).map(|n| format!("{base}_{n}"));
@@ -101,11 +102,15 @@ fn inputs(topics: &[DriveTopicInfo]) -> String {
             .chain(others)
             .find(|name| !names.contains(name))
             .unwrap_or_default();
+        let (mut shown, mut remark) = (visible(&topic.topic), String::new());
+        if topic.topic.parse::<TopicName>().is_err() {
+            remark = format!("# not a name of a ROS 2 topic; pass --remap '/{name}:={shown}'\n");
+            shown = format!("/{name}");
+        }
+        let type_name = visible(&topic.type_name);
         let _ = write!(
             text,
-            "\n[[input]]\nname = \"{name}\"\ntopic = \"{}\"\ntype = \"{}\"\n",
-            visible(&topic.topic),
-            visible(&topic.type_name)
+            "\n{remark}[[input]]\nname = \"{name}\"\ntopic = \"{shown}\"\ntype = \"{type_name}\"\n",
         );
         names.insert(name);
         text += &sizes(topic);
@@ -170,6 +175,8 @@ mod tests {
             type_name: "sensor_msgs/msg/Imu".to_owned(),
             messages: Some(12_345),
             is_defined: true,
+            layouts: 1,
+            malformed: 0,
             unreadable: None,
             messages_read: 12_345,
             interval: Some(DurationStats {
@@ -228,7 +235,7 @@ depth = 128                 # 1.3 s
         let damaged = Some("cut off".to_owned());
         assert_eq!(
             drive(&DriveInfo { start_ns: None, damaged, ..seen(Vec::new()) }),
-            "no messages: cut off; copy the file again if you can\n"
+            "no messages: cut off\n"
         );
     }
 
@@ -289,7 +296,7 @@ depth = 128                 # 1.3 s
         assert!(text.contains("from 0.0 to 0.5 s; --all reads the whole drive\n"), "{text}");
         assert!(
             text.contains(
-                "cut\\u{1b} off; copy the file again if you can\n2 messages out of order"
+                "cut\\u{1b} off\n2 messages out of order"
             ),
             "{text}"
         );

@@ -251,6 +251,11 @@ fn write_summary(
             paint.yellow(&format!("out of order: {messages} came after one with a later log time"))
         )?;
     }
+    for (topic, messages) in &summary.malformed {
+        let (topic, messages) = (visible(topic), counted(*messages, "message"));
+        let line = format!("malformed: {messages} of `{topic}`, left out");
+        writeln!(text, "  {}", paint.yellow(&line))?;
+    }
     write_early_end(text, summary, paint)?;
 
     if !summary.part.is_all() {

@@ -20,6 +20,7 @@ fn replay() -> ReplaySummary {
         skipped: 0,
         missed_ticks: 0,
         out_of_order: 0,
+        malformed: Default::default(),
         log_lines: 0,
         log_dropped: 0,
         triggers_refused: 0,

@@ -160,6 +160,8 @@ impl DriverInstance {
             seq,
             endian,
             options: [0; 2],
+            layout: 0,
+            is_latched: false,
         };
         self.transport.publish(topic, &meta, cdr).expect("the topic was added");
     }

@@ -125,6 +125,7 @@ fn attached() -> AttachedTopic {
         digests: 0,
         refused: 0,
         definitions: None,
+        type_hash: None,
         is_recorded: false,
         offered_qos: None,
     }

@@ -69,6 +69,7 @@ fn replies() -> Vec<ModelReply> {
         inputs: vec![info.clone()],
         outputs: vec![info],
         runtime: "rten 0.27.0, cpu, 1 thread".to_owned(),
+        metadata: vec![("task".to_owned(), "detect".to_owned())],
     };
     let fault = ModelFault::new(ModelFaultKind::TooSlow, "model `m` is still running");
     let results = [

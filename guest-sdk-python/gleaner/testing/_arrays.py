@@ -13,7 +13,7 @@ from ._drive import Delivery
 from ._error import ReplayError, quoted
 from ._path import FieldPath, compile_path
 from ._ring import Arrival
-from ._types import HEADER, Definitions, Types, dtype, gathered, none
+from ._types import HEADER, Definitions, Types, dtype, gathered
 
 IMAGE = "sensor_msgs/msg/Image"
 
@@ -29,8 +29,10 @@ class Arrays:
     ) -> None:
         """Creates a drive. ``type_names`` is the type of each topic, from the lambda's inputs.
         Raises ReplayError."""
-        types = gathered(none(), type_names.values(), more)
-        self._types = types
+        self._types = {
+            topic: gathered({}, type_name, more, _unusable(topic))
+            for topic, type_name in type_names.items()
+        }
         self.topics = dict(type_names)
         for topic in tables:
             if topic not in type_names:
@@ -40,7 +42,7 @@ class Arrays:
                     f"its topics are {quoted(type_names)}",
                 )
         self._tables = {
-            topic: _Messages(topic, type_names[topic], table, types)
+            topic: _Messages(topic, type_names[topic], table, self._types[topic])
             for topic, table in tables.items()
         }
         stamps = [
@@ -56,9 +58,9 @@ class Arrays:
     def is_partial(self) -> bool:
         return True
 
-    def types(self, wanted: Iterable[str], more: Definitions) -> Types:
-        """Returns the types of the drive, which were collected at its creation."""
-        return self._types
+    def types(self, topic: str, more: Definitions) -> Types:
+        """Returns the types of a topic, which were collected at the creation."""
+        return self._types[topic]
 
     def type_of(self, topic: str) -> str:
         return self.topics[topic]
@@ -203,4 +205,8 @@ def _times(topic: str, table: Table) -> List[int]:
 
 
 def _error(topic: str, cause: str, help: str) -> ReplayError:
-    return ReplayError(f"cannot use the arrays of topic `{topic}`", cause, help)
+    return ReplayError(_unusable(topic), cause, help)
+
+
+def _unusable(topic: str) -> str:
+    return f"cannot use the arrays of topic `{topic}`"

@@ -8,11 +8,11 @@ from typing import Any, Callable, Dict, List, Mapping, Optional, Union
 import numpy as np
 
 from ..data import Column, Counts, DataError, Identity, Stamps, Value
-from ._frame import Frame, FramePool
+from ._frame import Frame, FramePool, requested
 from ._manifest import Input
 from ._path import MissingElement, NotANumber, FieldPath, compile_path
 from ._ring import Cell, Lease, Ring
-from ._session import cut, i64, piece, u32, u64
+from ._session import cut, i64, u64
 from ._types import Types, stamp_of
 
 SAMPLES_PER_CALL, TEXTS_PER_FIELD, PATH_BYTES, PATHS = 256, 4096, 1024, 256
@@ -185,12 +185,8 @@ class Sample:
         return self._cell.arrival.cdr[1] == 0
 
     def cdr(self, offset: int = 0, len: Optional[int] = None) -> bytes:
-        return piece(
-            self._cell.arrival.cdr[4:],
-            offset,
-            None if len is None else u32(len),
-            self._source.limits["call_bytes"],
-        )
+        most, kind = self._source.limits["call_bytes"], f"sample of `{self._source.declared.topic}`"
+        return requested(self._cell.arrival.cdr[4:], offset, len, most, kind)
 
     def as_frame(self) -> Frame:
         source, cell = self._source, self._cell

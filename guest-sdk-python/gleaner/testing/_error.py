@@ -25,6 +25,11 @@ class StartError(ReplayError):
         """Kind, as of a fault: ``exception`` or ``memory``."""
 
 
+class TestFailed(BaseException):
+    """Ends the replay, through the code of the lambda, with its ``__cause__``: an error of the
+    test."""
+
+
 def nearest(name: str, known: Iterable[str]) -> Optional[str]:
     """Returns the known name that is most similar to ``name``, if one is similar enough."""
     found = difflib.get_close_matches(name, list(known), n=1)

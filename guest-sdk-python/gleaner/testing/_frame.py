@@ -14,7 +14,7 @@ import numpy.typing as npt
 from ..data import DataError, FrameInfo, Identity, Roi, Stamps
 from . import _pixels
 from ._manifest import COMPRESSED_IMAGE, MIB, Input
-from ._pixels import LAYOUTS, Bytes, ImageError, Picture, RangeError
+from ._pixels import LAYOUTS, ImageError, Picture, RangeError
 from ._ring import Lease
 from ._session import piece, u32
 
@@ -94,9 +94,7 @@ class FramePool:
         taken = self.budget.take(0)
         try:
             if declared.type_name == COMPRESSED_IMAGE:
-                decoded = self._decoded(
-                    declared, lease.cell.position, np.asarray(given.data).tobytes()
-                )
+                decoded = self._decoded(declared, lease.cell.position, given)
                 return Frame(about, decoded.picture, taken, decoded)
             data = np.asarray(given.data, dtype=np.uint8)
             size = int(given.width), int(given.height)
@@ -107,12 +105,14 @@ class FramePool:
         except ImageError as error:
             raise _not_a_frame(declared.topic, error) from None
 
-    def _decoded(self, declared: Input, position: int, data: bytes) -> DecodedImage:
+    def _decoded(self, declared: Input, position: int, given: Any) -> DecodedImage:
         if self._newest is not None and self._newest[0] == position:
             return self._newest[1]
         # Release the previous image first: its slot may be needed now.
         self._newest = None
-        opened = _open(declared, data)
+        data = np.asarray(given.data).tobytes()
+        file, encoding = _pixels.compressed(str(given.format), data)
+        opened = _open(declared, file)
         width, height = opened.size
         if 3 * width * height > self._slot_bytes:
             says = f"image has a size of {width}x{height} ({_size(3 * width * height)} as rgb8)"
@@ -125,7 +125,7 @@ class FramePool:
             raise DataError(
                 f"every slot for decoded images of `{declared.topic}` is held; {why}", "no-room"
             )
-        decoded = DecodedImage(_pixels.tight(_rgb(opened), "rgb8"))
+        decoded = DecodedImage(_picture(opened, encoding))
         self._held.append(weakref.ref(decoded))
         self._newest = (position, decoded)
         return decoded
@@ -135,10 +135,6 @@ def _open(declared: Input, data: bytes) -> Any:
     """Reads the header. Raises ImageError; DataError for a size that Pillow treats as an attack."""
     from PIL import Image
 
-    if not data.startswith((b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n")):
-        raise ImageError(
-            f"data is neither JPEG nor PNG: its {len(data)} bytes start with {list(data[:8])}"
-        )
     try:
         with warnings.catch_warnings():
             # Images that Pillow only warns of are limited by `decoded_size`.
@@ -157,13 +153,29 @@ def _too_large(declared: Input, why: str) -> DataError:
     return DataError(f"an image of `{declared.topic}` is too large: {why}", "no-room")
 
 
-def _rgb(opened: Any) -> Bytes:
+def _picture(opened: Any, encoding: str) -> Picture:
     try:
-        return np.asarray(opened.convert("RGB"), dtype=np.uint8)
+        if encoding == "mono16":
+            values = np.asarray(opened).astype("<u2")
+            return _pixels.tight(values.view(np.uint8).reshape(*values.shape, 2), encoding)
+        return _pixels.tight(np.asarray(opened.convert("RGB")), encoding)
     except Exception as error:
         raise ImageError(
             f"cannot decode the {opened.format} of {opened.width}x{opened.height}: {error}"
         ) from None
+
+
+def requested(whole: bytes, offset: int, length: Optional[int], most: int, kind: str) -> bytes:
+    """Returns ``length`` bytes from ``offset``, or fewer where ``whole`` ends. Raises DataError
+    (``out-of-range``) for more than ``most``."""
+    found = piece(whole, offset, None if length is None else u32(length), 2**32 - 1)
+    if len(found) > most:
+        raise DataError(
+            f"{len(found)} bytes of a {kind} are requested; one call returns at most {most}: read "
+            "it in pieces, by `offset` and `len`",
+            "out-of-range",
+        )
+    return found
 
 
 def _size(count: int) -> str:
@@ -226,6 +238,10 @@ class Frame:
     def resize(self, width: int, height: int) -> Frame:
         width, height = u32(width), u32(height)
         size = width * height * (1 if self._picture.is_grey else 3)
+        if self._picture.encoding == "mono16":
+            way_out = "call `to_gray` first, or read its pixels"
+            error = ImageError(f"resize of mono16 would keep 8 of its 16 bits: {way_out}")
+            raise _not_a_frame(self.identity.topic, error)
         return self._made(
             "resize", (width, height), size, lambda: _pixels.resize(self._picture, width, height)
         )
@@ -237,12 +253,8 @@ class Frame:
         )
 
     def read(self, offset: int = 0, len: Optional[int] = None) -> bytes:
-        return piece(
-            self._picture.data.tobytes(),
-            offset,
-            None if len is None else u32(len),
-            self._taken.budget.call_bytes,
-        )
+        most, kind = self._taken.budget.call_bytes, f"frame of `{self.identity.topic}`"
+        return requested(self._picture.data.tobytes(), offset, len, most, kind)
 
     def array(self) -> npt.NDArray[Any]:
         return np.asarray(View(self._picture, (self._holds, self._taken)))

@@ -14,7 +14,7 @@ from typing import Any, Callable, Iterator, List, Optional, Tuple, Union
 from .. import _host
 from ._context import Context, set_missed
 from ._data import InputState, sample
-from ._error import ReplayError, StartError
+from ._error import ReplayError, StartError, TestFailed
 from ._manifest import Manifest
 from ._ring import Cell
 from ._schedule import Tick
@@ -95,8 +95,9 @@ class Guest:
         return _host.maker(self._given, self._manifest.handler, _name(self._given))
 
     def _attempt(self, when: str, call: Any, *arguments: Any) -> Tuple[Any, Optional[Fault]]:
-        """Calls code of the lambda. Ctrl-C ends the replay; every other exception is a fault."""
-        stopped = None
+        """Calls code of the lambda. Ctrl-C and errors of the test end the replay; every other
+        exception is a fault."""
+        stopped: Optional[BaseException] = None
 
         def called(*arguments: Any) -> Any:
             nonlocal stopped
@@ -104,6 +105,9 @@ class Guest:
                 return call(*arguments)
             except KeyboardInterrupt as error:
                 stopped = error
+                raise
+            except TestFailed as error:
+                stopped = error.__cause__
                 raise
             except BaseException as error:
                 # A traceback keeps the stack frames of a call, which keep the sample. Keep only the

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import numbers
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import (
@@ -17,6 +18,7 @@ from typing import (
     Optional,
     Sequence,
     Tuple,
+    TypeVar,
     get_args,
 )
 
@@ -26,15 +28,23 @@ import numpy.typing as npt
 from .. import inference
 from ..inference import Detection, DetectOptions, ElementType, InferenceError, Preprocess
 from ..inference import TensorInfo
-from ._error import ReplayError, quoted
+from ._error import ReplayError, TestFailed, quoted
 from ._frame import Frame, no_memory
 from ._manifest import DeclaredModel
 from ._session import piece, u32, u64
+
+T = TypeVar("T")
 
 MAX_DIMENSIONS, MAX_SIDE, MAX_DETECTIONS = 8, 8192, 1024
 
 # The other encodings are Bayer patterns and have 16 bits.
 READABLE = ("rgb8", "bgr8", "rgba8", "bgra8", "mono8", "yuv422", "yuv422_yuy2")
+
+RIGHT_ANSWERS = {
+    "run": 'return a dict of arrays, such as {"boxes": np.zeros((1, 4), np.float32)}',
+    "detect": 'return a list such as [Detection(class_=0, label="person", score=0.9, x=4, y=8, '
+    "width=2, height=5)], with a score from 0 to 1 and sides above 0",
+}
 
 
 @dataclass(frozen=True)
@@ -47,7 +57,8 @@ class FakeModel:
 
         replay(Lambda, "drive.mcap", models={"detector": FakeModel(detect)})
 
-    The functions may raise InferenceError; the lambda gets it.
+    The functions may raise InferenceError; the lambda gets it. A wrong answer raises ReplayError,
+    and every other exception ends the replay: neither is a fault of the lambda.
     """
 
     detect: Optional[Callable[[Frame], Iterable[Detection]]] = None
@@ -75,12 +86,15 @@ class ModelTable:
         self.declared = {model.name: model for model in declared}
         self.answers, self.limits = answers, limits
         self.bytes_left = limits["memory"]
-        for name in answers:
+        for name, fake in answers.items():
             if name not in self.declared:
                 raise ReplayError(
                     f"no model `{name}` for answers",
                     help=f"the manifest has {quoted(self.declared)}",
                 )
+            if not isinstance(fake, FakeModel):
+                help = f'pass models={{"{name}": FakeModel(...)}}'
+                raise ReplayError(f"the answers of model `{name}` are not a FakeModel", "", help)
 
 
 # The models of the lambda that runs.
@@ -225,9 +239,35 @@ class Model:
     def run(self, inputs: List[Tuple[str, Tensor]]) -> List[Tuple[str, Tensor]]:
         if self._answers.run is None:
             raise self._no_answer("run")
-        outputs = self._answers.run({name: tensor.array() for name, tensor in inputs})
-        tensors = {name: inference.Tensor.from_values(array) for name, array in outputs.items()}
+        given = {name: tensor.array() for name, tensor in inputs}
+        arrays = _answered(self._answers.run, given, self._outputs)
+        tensors = {name: inference.Tensor.from_values(array) for name, array in arrays.items()}
         return [(name, tensor._handle) for name, tensor in tensors.items()]  # type: ignore[misc]
+
+    def _outputs(self, answer: Any) -> Dict[str, npt.NDArray[Any]]:
+        if not isinstance(answer, Mapping):
+            raise self._wrong_answer("run", f"{answer!r:.80} is not a dict")
+        arrays = {name: np.asarray(values) for name, values in answer.items()}
+        for name, array in arrays.items():
+            if array.dtype != np.bool_ and array.dtype.name not in get_args(ElementType):
+                cause = f"`{name}` is of {array.dtype}, which a tensor cannot have"
+                raise self._wrong_answer("run", cause)
+        return arrays
+
+    def _detections(self, answer: Any) -> List[Detection]:
+        if not isinstance(answer, Iterable):
+            raise self._wrong_answer("detect", f"{answer!r:.80} is not a list")
+        found = list(answer)
+        for one in found:
+            if (
+                not isinstance(one, Detection)
+                or not isinstance(one.label, str)
+                or not isinstance(one.class_, numbers.Integral)
+                or not all(isinstance(it, numbers.Real) and math.isfinite(it) for it in one[2:])
+                or not (0 <= one.score <= 1 and one.width > 0 and one.height > 0)
+            ):
+                raise self._wrong_answer("detect", f"{one!r:.160} is not a Detection")
+        return [Detection(int(one.class_), one.label, *map(float, one[2:])) for one in found]
 
     def detect(self, frame: Frame, options: DetectOptions) -> List[Detection]:
         name, answers = self._declared.name, self._answers
@@ -247,15 +287,20 @@ class Model:
         _check_frame(frame)
         if answers.detect is None:
             raise self._no_answer("detect")
+        detections = _answered(answers.detect, frame, self._detections)
         classes = set(options.classes)
         found = [
             one
-            for one in answers.detect(frame)
+            for one in detections
             if one.score >= options.min_score
             and (not classes or one.label in classes or str(one.class_) in classes)
         ]
         found.sort(key=lambda one: -one.score)
         return found[: min(u32(options.max_count), MAX_DETECTIONS)]
+
+    def _wrong_answer(self, call: str, cause: str) -> ReplayError:
+        what = f"the test's answer of `{call}` for model `{self._declared.name}` is wrong"
+        return ReplayError(what, cause, RIGHT_ANSWERS[call])
 
     def _no_answer(self, call: str) -> InferenceError:
         return InferenceError(
@@ -263,6 +308,17 @@ class Model:
             f"FakeModel({call}=...)",
             "unavailable",
         )
+
+
+def _answered(answer: Callable[[Any], Any], given: Any, check: Callable[[Any], T]) -> T:
+    """Calls code of the test, which may raise InferenceError. Its other errors are no faults of the
+    lambda."""
+    try:
+        return check(answer(given))
+    except InferenceError:
+        raise
+    except Exception as error:
+        raise TestFailed from error
 
 
 def _check_frame(frame: Frame) -> None:

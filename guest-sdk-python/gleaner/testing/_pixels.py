@@ -2,10 +2,11 @@
 those of the host bit for bit.
 
 Sources: ITU-R BT.601 for luma; JFIF 1.02 for colours of yuv422, both as in `pixels` of the crate
-`gleaner-rules`."""
+`gleaner-rules`; formats of compressed images as in the crate `gleaner-image`."""
 
 from __future__ import annotations
 
+import re
 from typing import Any, NamedTuple, Optional, Tuple
 
 import numpy as np
@@ -14,6 +15,7 @@ import numpy.typing as npt
 Bytes = npt.NDArray[np.uint8]
 
 MAX_SIDE, MAX_RESIZED_SIDE = 65_535, 16_384
+PNG = b"\x89PNG\r\n\x1a\n"
 
 # Bytes per pixel and numbers per pixel, by the name in the WIT.
 LAYOUTS = {
@@ -100,6 +102,39 @@ def picture(
             f"it has {len(data)}"
         )
     return Picture(width, height, name, step, big_endian, data[:needed])
+
+
+def compressed(format: str, data: bytes) -> Tuple[bytes, str]:
+    """Returns the file in a `sensor_msgs/msg/CompressedImage`, and the encoding of its pixels, rgb8
+    or mono16. Raises ImageError for a format that is not decoded, or contradicts the bytes."""
+    words, why = re.split("[; ]", format), ""
+    is_depth = "compressedDepth" in words
+    file = data[12:] if is_depth and data[12:].startswith(PNG) else data
+    kind, found = ("PNG" if file.startswith(PNG) else "JPEG"), "8"
+    if kind == "PNG" and file[24:25] == b"\x10":
+        found = "16"
+        if file[25:26] != b"\0":
+            why = "PNG is of 16 bits per value with colour or alpha, which is not supported"
+            raise ImageError(f"{why}: publish baseline JPEG, or PNG of 8 bits")
+    sizes = ("8", "16", "32", "64")
+    named = [(word, n) for word in words for n in re.findall("[0-9]+", word) if n in sizes]
+    if not file.startswith((b"\xff\xd8\xff", PNG)):
+        start = ", ".join(f"{byte:02x}" for byte in file[:8])
+        why = f"data is neither JPEG nor PNG: its {len(file)} bytes start with [{start}]; "
+        why += "publish JPEG or PNG, depth as `16UC1; compressedDepth png`"
+    elif is_depth and not named:
+        why = "name the encoding, as in `16UC1; compressedDepth png`"
+    elif named and named[-1][0].startswith("bayer_"):
+        why = "raw pixels have no colour: debayer first, for example by image_proc"
+    elif named and named[-1][1] != found:
+        name, bits = named[-1]
+        why = (
+            f"{name} has {bits} bits per value, and the {kind} has {found}: publish depth as 16UC1 "
+            "in PNG, others with 8 bits, and name what is sent"
+        )
+    if why:
+        raise ImageError(f"format `{format[:64]}`: {why}")
+    return file, "mono16" if found == "16" else "rgb8"
 
 
 def rows(shown: Picture) -> Bytes:

@@ -64,8 +64,9 @@ def replay(
     each ``[[model]]`` that the lambda opens. Text that the lambda prints goes to its log; with
     ``prints_to_log=False``, for example in a debugger, it goes to standard output.
 
-    Raises ReplayError if an argument cannot be used, and StartError if the lambda's import or
-    ``init`` raises. An exception in a wake is a fault in its decision. Ctrl-C ends the replay."""
+    Raises ReplayError if an argument cannot be used, or the answer of a model is wrong, and
+    StartError if the lambda's import or ``init`` raises. An exception in a wake is a fault in its
+    decision. Ctrl-C ends the replay."""
     source = manifest if manifest is not None else manifest_beside(lambda_)
     read = _manifest.read(source, config or {})
     if isinstance(lambda_, (str, os.PathLike)) and read.kind != "python":
@@ -118,10 +119,15 @@ class _ReplayLoop:
                 raise ReplayError(
                     f"input `{declared.name}` is of type `{declared.type_name}`", cause
                 )
-        types = drive.types([declared.type_name for declared in inputs], more)
         budget = Budget(limits)
         return [
-            InputState(declared, types, limits, FramePool(declared, budget)) for declared in inputs
+            InputState(
+                declared,
+                drive.types(names[declared.topic], more),
+                limits,
+                FramePool(declared, budget),
+            )
+            for declared in inputs
         ]
 
     def run(self, prints_to_log: bool) -> Run:

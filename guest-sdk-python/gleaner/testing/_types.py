@@ -4,8 +4,9 @@ definitions."""
 from __future__ import annotations
 
 import functools
+import textwrap
 from pathlib import Path
-from typing import Any, Dict, Iterable, List, Mapping, NamedTuple, Optional, Tuple
+from typing import Any, Dict, Iterator, List, Mapping, NamedTuple, Optional, Tuple
 
 import numpy as np
 from rosbags.interfaces import Nodetype
@@ -15,6 +16,9 @@ from rosbags.typesys.store import Typestore
 from ._error import ReplayError
 
 HEADER, TIME = "std_msgs/msg/Header", "builtin_interfaces/msg/Time"
+PASS_TYPES = (
+    'pass types={"%s": "the text of its .msg"}, or put its .msg file into msg/ beside the lambda'
+)
 INTEGERS = ("int8", "int16", "int32", "int64", "uint16", "uint32", "uint64")
 
 
@@ -38,7 +42,7 @@ class Member(NamedTuple):
 
 
 class Types:
-    """The message types of one drive that a lambda reads."""
+    """The message type of one topic, with all that it refers to."""
 
     def __init__(self, store: Typestore) -> None:
         self._store = store
@@ -61,6 +65,23 @@ class Types:
         return first.length is None and (
             first.element == HEADER or (first.name, first.element) == ("stamp", TIME)
         )
+
+    def layout(self, type_name: str, path: str = "") -> Iterator[str]:
+        """Yields the primitive fields in the order of the message, such as ``float64 linear.x``."""
+        for member in self.members(type_name):
+            count = {None: "", -1: "[]"}.get(member.length, f"[{member.length}]")
+            if member.is_primitive or member.is_wide:
+                yield f"{member.element}{count} {path}{member.name}"
+            else:
+                yield from self.layout(member.element, f"{path}{member.name}{count}.")
+
+    def digest(self, type_name: str) -> Optional[str]:
+        """Returns the hash of a type by REP 2011; None if it has a type that `rosbags` cannot
+        hash."""
+        try:
+            return self._store.hash_rihs01(type_name)
+        except KeyError:
+            return None
 
     def decode(self, cdr: bytes, type_name: str) -> Any:
         """Decodes ``cdr``, which begins with the encapsulation header. Raises the exceptions of
@@ -108,7 +129,7 @@ class Definitions:
         self._folder = folder
         self._given: Dict[str, Any] = {}
         for type_name, text in texts.items():
-            self._given.update(_parsed(type_name, text, "pass the text of its .msg"))
+            self._given.update(parsed(type_name, text, "pass the text of its .msg"))
 
     def find(self, type_name: str) -> Any:
         """Returns the definition of a type, or None. Texts take precedence over files in folders of
@@ -134,52 +155,43 @@ class Definitions:
             text = path.read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
             raise ReplayError(f"cannot read `{path}`", str(error)) from None
-        return _parsed(type_name, text, f"correct `{path}`").get(type_name)
+        return parsed(type_name, text, f"correct `{path}`").get(type_name)
 
 
-def _parsed(type_name: str, text: str, help: str) -> Dict[str, Any]:
+def parsed(type_name: str, text: str, help: str, what: str = "") -> Dict[str, Any]:
+    """Parses the text of a `.msg`, with those of other types that follow it. An invalid one raises
+    ReplayError, with ``help`` and ``what``."""
     try:
         return dict(get_types_from_msg(text, type_name))
     except Exception as error:
-        raise ReplayError(f"cannot use the definition of `{type_name}`", str(error), help) from None
+        why = textwrap.shorten(str(error), 200, placeholder=" ...")
+        what = what or f"cannot use the definition of `{type_name}`"
+        raise ReplayError(what, f"the definition is not that of a message: {why}", help) from None
 
 
-def gathered(own: Typestore, wanted: Iterable[str], more: Definitions) -> Types:
-    """Collects types with all that they refer to: from the drive's ``own``, or else from ``more``.
+def gathered(own: Mapping[str, Any], type_name: str, more: Definitions, what: str) -> Types:
+    """Collects a type with all that it refers to: from the topic's ``own``, or else from ``more``.
 
-    Raises ReplayError for a type in neither."""
+    Raises ReplayError, which begins with ``what``, for a type in neither."""
     known: Dict[str, Any] = {}
-    rest = [(type_name, type_name) for type_name in wanted]
+    root, rest = type_name, [type_name]
     while rest:
-        type_name, root = rest.pop()
+        type_name = rest.pop()
         if type_name in known:
             continue
-        found = own.fielddefs.get(type_name) or more.find(type_name)
+        found = own.get(type_name) or more.find(type_name)
         if found is None:
-            cause = f"`{root}` refers to it" if root != type_name else ""
-            help = (
-                'pass types={"%s": "the text of its .msg"}, or put its .msg file into msg/ beside '
-                "the lambda" % type_name
-            )
-            raise ReplayError(f"there is no definition of `{type_name}`", cause, help)
+            refers = f", to which `{root}` refers" if root != type_name else ""
+            cause = f"there is no definition of `{type_name}`{refers}"
+            raise ReplayError(what, cause, PASS_TYPES % type_name)
         known[type_name] = found
         elements = [_member(name, description).element for name, description in found[1]]
-        rest += [
-            (element, root)
-            for element in elements
-            if "/" in element and not element.endswith("/wstring")
-        ]
-    for store in (own, _humble()):
-        if all(store.fielddefs.get(type_name) is found for type_name, found in known.items()):
-            return Types(store)
-    store = get_typestore(Stores.EMPTY)
-    store.register(known)
+        rest += [it for it in elements if "/" in it and not it.endswith("/wstring")]
+    store = _humble()
+    if any(store.fielddefs.get(type_name) is not found for type_name, found in known.items()):
+        store = get_typestore(Stores.EMPTY)
+        store.register(known)
     return Types(store)
-
-
-def none() -> Typestore:
-    """Returns the type store of a drive without definitions."""
-    return get_typestore(Stores.EMPTY)
 
 
 @functools.lru_cache(maxsize=None)

@@ -12,6 +12,8 @@
 //!
 //! Kernels never call the host, and allocate memory only where documented. Kernels on pixels read
 //! rgb8, bgr8 and mono8 only.
+// Its code is compiled and run with the examples of this crate.
+#![cfg_attr(all(doctest, feature = "fft"), doc = include_str!("../../../docs/kernels.md"))]
 
 pub mod downscale;
 #[cfg(feature = "fft")]
@@ -22,7 +24,8 @@ pub mod mean;
 
 use std::fmt;
 
-use crate::data::{Encoding, FrameInfo, Roi, bytes_per_pixel, encoding_name};
+pub use crate::data::{Encoding, Roi};
+use crate::data::{FrameInfo, bytes_per_pixel, encoding_name};
 
 /// Maximum width and height of an image, in pixels; the same as in the host.
 pub const MAX_SIDE: u32 = 65_535;
@@ -30,8 +33,7 @@ pub const MAX_SIDE: u32 = 65_535;
 /// An image in the memory of the lambda, with a validated size.
 ///
 /// ```
-/// use gleaner_sdk::data::Encoding;
-/// use gleaner_sdk::kernels::{Image, luma};
+/// use gleaner_sdk::kernels::{Encoding, Image, luma};
 ///
 /// // Two pixels, red and white, and two bytes of padding.
 /// let image = Image::new(2, 1, 8, Encoding::Rgb8, &[255, 0, 0, 255, 255, 255, 0, 0]).unwrap();

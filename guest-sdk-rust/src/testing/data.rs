@@ -91,6 +91,20 @@ impl InputState {
         Sample { source: Arc::clone(self), cell, _handle: self.handles.acquire() }
     }
 
+    /// Returns `len` bytes from `offset`, or fewer where `whole` ends. Panics for more than one
+    /// call returns, where the host ends the lambda.
+    pub(super) fn requested(&self, whole: &[u8], (offset, len): (u64, u32), kind: &str) -> Vec<u8> {
+        let (topic, most) = (&self.declared.topic, self.limits.per_call.bytes);
+        let piece = clamps::piece(whole.len(), offset, len as usize);
+        let bytes = piece.len();
+        assert!(
+            bytes <= most,
+            "{bytes} bytes of a {kind} of `{topic}` are requested; one call returns at most {most}: \
+             read it in pieces, by `offset` and `len`"
+        );
+        whole[piece].to_vec()
+    }
+
     fn malformed(&self, why: &str) -> DataError {
         DataError::Malformed(refused::malformed(
             &self.declared.topic,
@@ -290,8 +304,7 @@ impl Sample {
     }
 
     pub(crate) fn cdr(&self, offset: u64, len: u32) -> Vec<u8> {
-        let bytes = self.bytes();
-        bytes[self.source.limits.per_call.piece(bytes.len(), offset, len)].to_vec()
+        self.source.requested(self.bytes(), (offset, len), "sample")
     }
 
     pub(crate) fn as_frame(&self) -> CallResult<Frame> {

@@ -142,6 +142,11 @@ impl Frame {
 
     pub(crate) fn resize(&self, width: u32, height: u32) -> CallResult<Self> {
         let view = self.view()?;
+        if view.encoding() == rules::Encoding::Mono16 {
+            let why = "resize of mono16 would keep 8 of its 16 bits: call `to_gray` first, or read \
+                       its pixels";
+            return Err(DataError::NotAFrame(refused::not_a_frame(&self.identity.topic, why)));
+        }
         let (encoding, _) =
             ops::resized(&view, width, height).map_err(|error| self.refused(error))?;
         self.made((width, height), encoding, |out| ops::resize(&view, width, height, out).map(drop))
@@ -171,8 +176,7 @@ impl Frame {
     }
 
     pub(crate) fn read(&self, offset: u64, len: u32) -> Vec<u8> {
-        let bytes = self.bytes();
-        bytes[self.source.limits.per_call.piece(bytes.len(), offset, len)].to_vec()
+        self.source.requested(self.bytes(), (offset, len), "frame")
     }
 
     fn bytes(&self) -> &[u8] {

@@ -50,6 +50,16 @@ fn operations_read_the_pixels_and_errors_have_a_kind() {
     });
     run.deliver("camera", 0, Message::image(2, 1, Encoding::BayerRggb8, [1, 2])).unwrap();
     assert_eq!(run.faults().next(), None);
+
+    let mut run = on_event(camera(false, ""), |sample| {
+        let frame = sample.as_frame()?;
+        let error = frame.resize(1, 1).map(drop).unwrap_err();
+        assert!(error.to_string().contains("call `to_gray` first, or read its pixels"), "{error}");
+        assert_eq!(pixels(frame.to_gray()?), (1, 1, Encoding::Mono8, vec![2]));
+        Ok(())
+    });
+    run.deliver("camera", 0, Message::image(1, 1, Encoding::Mono16, [1, 2])).unwrap();
+    assert_eq!(run.faults().next(), None);
 }
 
 #[test]

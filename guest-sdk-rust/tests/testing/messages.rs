@@ -113,6 +113,20 @@ fn reading_bytes_that_the_test_did_not_set_is_a_fault_that_asks_for_them() {
 }
 
 #[test]
+fn a_call_that_would_return_more_than_its_limit_is_a_fault_that_names_the_way_on() {
+    let mut run = on_event(imu("max_size = \"2 MiB\"", ""), |sample| {
+        assert_eq!(sample.cdr(3, 1 << 20).len(), 1 << 20);
+        sample.cdr(0, u32::MAX);
+        Ok(())
+    });
+    run.deliver("imu", 0, Message::new().cdr(vec![0; 4 + 3 + (1 << 20)])).unwrap();
+    let fault = run.faults().next().unwrap();
+    assert_eq!(fault.kind, FaultKind::Trap);
+    assert!(fault.message.contains("1048579 bytes of a sample of `/imu"), "{fault:?}");
+    assert!(fault.message.contains("at most 1048576: read it in pieces"), "{fault:?}");
+}
+
+#[test]
 fn fields_of_another_input_and_malformed_paths_are_refused() {
     let more = "[[input]]\nname = \"speed\"\ntopic = \"/speed\"\ntype = \"car/msg/Speed\"\n";
     let mut run = on_event(imu("", more), |sample| {

@@ -113,7 +113,16 @@ mod tests {
         // The writer has another clock.
         let publish_ns = at_ns - 1_000 * SECOND;
         let (endian, options) = (Endian::Little, [0; 2]);
-        SampleMeta { at_ns, publish_ns, writer: Guid(guid), seq, endian, options }
+        SampleMeta {
+            at_ns,
+            publish_ns,
+            writer: Guid(guid),
+            seq,
+            endian,
+            options,
+            layout: 0,
+            is_latched: false,
+        }
     }
 
     /// The count after samples `first..first + count` of a writer, at 100 Hz from `at_ns` on, and a

@@ -1,19 +1,22 @@
 //! Caches the definitions of message types: each is searched once, locally and, on demand, at a
-//! node that writes the type.
+//! node that writes the type. Writers that announce another hash than that of the local definition
+//! have another layout, of which only such a node has the definition.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use rustdds::DomainParticipant;
 use tracing::{info, warn};
 
+use super::discovery;
 use super::names::{dds_type, visible};
+use super::qos::Offer;
 use super::receive::{ReceiverCommand, ReceiverHandle};
 use super::state::ParticipantState;
 use super::type_query::{Attempts, QueryOutcome, Retry, TypeQuery};
 use gleaner_base::chain;
-use gleaner_messages::type_description::DescribedDefinitions;
+use gleaner_messages::type_description::{DescribedDefinitions, type_hash};
 use gleaner_messages::{Definitions, MessageError, Sources, SourcesError};
 use gleaner_transport::DefinitionsSearch;
 
@@ -30,22 +33,29 @@ const PAUSE: Duration = Duration::from_secs(10);
 /// Most types that are remembered to have no definitions: more than there are topics.
 const MOST: usize = 8192;
 
-/// Definitions by type.
+/// Help where a definition is missing.
+const HELP: &str = "put the publisher's `.msg` files into the `msg` folder of the lambda";
+
+/// A type, and the hash of its layout if its writers announce one.
+type TypeKey = (String, Option<String>);
+
+/// Definitions by type and layout.
 #[derive(Debug)]
 pub(super) struct DefinitionsCache {
     sources: Sources,
-    types: HashMap<String, CachedType>,
+    types: HashMap<TypeKey, CachedType>,
     open: Option<(TypeQuery, Instant)>,
     tickets: u64,
     since: Instant,
-    /// The types of all writers, as DDS names them, and the time of this list.
-    written: Option<(HashSet<String>, Instant)>,
+    /// The types of all writers, as DDS names them, with the hashes that they announce; and when
+    /// they were listed.
+    written: Option<(HashMap<String, Vec<String>>, Instant)>,
 }
 
 #[derive(Debug)]
 enum CachedType {
-    /// The text, and its parsed form once a caller needed it.
-    Text(Arc<str>, Option<Arc<Definitions>>),
+    /// The text, its parsed form once a caller needed it, and the hash of the type.
+    Text(Arc<str>, Option<Arc<Definitions>>, Option<String>),
     Missing(Missing),
 }
 
@@ -65,28 +75,40 @@ impl DefinitionsCache {
         Self { sources, types: HashMap::new(), open: None, tickets: 0, since, written: None }
     }
 
-    /// The text of a type's definitions, if there is one.
-    pub(super) fn text(&mut self, type_name: &str) -> Option<Arc<str>> {
-        match self.entry(type_name) {
-            CachedType::Text(text, _) => Some(text.clone()),
+    /// The text of a type's definitions in the layout with `hash`, if there is one; without `hash`,
+    /// the local one.
+    pub(super) fn text(&mut self, type_name: &str, hash: Option<&str>) -> Option<Arc<str>> {
+        match self.entry(type_name, hash) {
+            CachedType::Text(text, ..) => Some(text.clone()),
             CachedType::Missing(_) => None,
         }
     }
 
-    /// The parsed definitions of a type, if there are any; shared by all callers.
+    /// The hash of the local definition of a type, if there is one.
+    pub(super) fn hash_at_hand(&mut self, type_name: &str) -> Option<String> {
+        match self.entry(type_name, None) {
+            CachedType::Text(_, _, hash) => hash.clone(),
+            CachedType::Missing(_) => None,
+        }
+    }
+
+    /// The same as [`text`](Self::text), parsed; shared by all callers.
     pub(super) fn parsed(
         &mut self,
         type_name: &str,
+        hash: Option<&str>,
     ) -> Result<Option<Arc<Definitions>>, MessageError> {
-        let CachedType::Text(text, parsed) = self.entry(type_name) else { return Ok(None) };
+        let CachedType::Text(text, parsed, _) = self.entry(type_name, hash) else {
+            return Ok(None);
+        };
         if parsed.is_none() {
             *parsed = Some(Arc::new(Definitions::parse(type_name, text)?));
         }
         Ok(parsed.clone())
     }
 
-    /// Returns whether definitions that are missing now may still come. Starts a query if there is
-    /// none, and if the type has a writer.
+    /// Returns whether definitions that are missing now, of any layout that is written, may still
+    /// come. Starts a query if there is none, and if the type has a writer.
     pub(super) fn search(
         &mut self,
         type_name: &str,
@@ -95,44 +117,64 @@ impl DefinitionsCache {
         state: &ParticipantState,
     ) -> DefinitionsSearch {
         self.collect(state);
-        let Missing { attempts: before, settled, pause } = match self.entry(type_name) {
-            CachedType::Text(..) => return DefinitionsSearch::Waiting,
-            CachedType::Missing(missing) => *missing,
-        };
         let now = Instant::now();
-        if settled || before.times >= MOST_QUERIES || pause.is_some_and(|until| now < until) {
+        // Nodes describe types of services and actions, too, which no `.msg` text can express.
+        let Some(name) = dds_type(type_name).filter(|name| name.contains("::msg::")) else {
             return DefinitionsSearch::Ended;
-        }
-        if !self.is_written(type_name, participant, now) {
+        };
+        let Some(announced) = self.written(&name, participant, now) else {
             // Not remembered: a writer may start at any time.
-            let is_young = now < self.since + DISCOVERY;
-            return if is_young { DefinitionsSearch::Waiting } else { DefinitionsSearch::Ended };
+            let may_come = now < self.since + DISCOVERY || self.text(type_name, None).is_some();
+            return if may_come { DefinitionsSearch::Waiting } else { DefinitionsSearch::Ended };
+        };
+        let mut search = DefinitionsSearch::Waiting;
+        for type_hash in announced {
+            let CachedType::Missing(missing) = self.entry(type_name, type_hash.as_deref()) else {
+                continue;
+            };
+            let Missing { attempts: before, settled, pause } = *missing;
+            if settled || before.times >= MOST_QUERIES || pause.is_some_and(|until| now < until) {
+                search = DefinitionsSearch::Ended;
+                continue;
+            }
+            // One query at a time.
+            if self.open.is_some() {
+                return DefinitionsSearch::Waiting;
+            }
+            self.tickets += 1;
+            let (ticket, type_name) = (self.tickets, type_name.to_owned());
+            let query = TypeQuery { ticket, type_name, type_hash, before };
+            receiver.send(ReceiverCommand::Query(query.clone()));
+            self.open = Some((query, now));
+            return DefinitionsSearch::Started;
         }
-        // One query at a time.
-        if self.open.is_some() {
-            return DefinitionsSearch::Waiting;
-        }
-        self.tickets += 1;
-        let query = TypeQuery { ticket: self.tickets, type_name: type_name.to_owned(), before };
-        receiver.send(ReceiverCommand::Query(query.clone()));
-        self.open = Some((query, now));
-        DefinitionsSearch::Started
+        search
     }
 
-    /// Returns whether there is a writer of a type.
-    fn is_written(
+    /// The hashes that writers of a type announce, or `None` as the only one; `None` if there is no
+    /// writer.
+    fn written(
         &mut self,
-        type_name: &str,
+        dds_type: &str,
         participant: &DomainParticipant,
         now: Instant,
-    ) -> bool {
-        let Some(name) = dds_type(type_name) else { return false };
+    ) -> Option<Vec<Option<String>>> {
         self.written.take_if(|(_, at)| now >= *at + WRITTEN);
         let (types, _) = self.written.get_or_insert_with(|| {
-            let writers = participant.discovered_writers().into_iter();
-            (writers.map(|writer| writer.publication_topic_data.type_name).collect(), now)
+            let mut types: HashMap<String, Vec<String>> = HashMap::new();
+            for writer in participant.discovered_writers() {
+                let Offer { type_name, type_hash, .. } = discovery::offer(&writer);
+                let hashes = types.entry(type_name).or_default();
+                hashes.extend(type_hash.filter(|hash| !hashes.contains(hash)));
+            }
+            (types, now)
         });
-        types.contains(&name)
+        let hashes = types.get(dds_type)?;
+        Some(if hashes.is_empty() {
+            vec![None]
+        } else {
+            hashes.iter().cloned().map(Some).collect()
+        })
     }
 
     /// Takes the outcome of the open query, if there is one.
@@ -146,6 +188,7 @@ impl DefinitionsCache {
         let query = query.clone();
         self.open = None;
         let type_name = &query.type_name;
+        let at_hand = self.hash_at_hand(type_name);
         let mut attempts = Attempts { times: query.before.times + 1, ..query.before };
         let entry = match outcome {
             QueryOutcome::Failed { why, retry: Retry::Unsent } => {
@@ -157,8 +200,11 @@ impl DefinitionsCache {
                 attempts.unanswered += 1;
                 warn!(
                     type_name,
+                    announced = query.type_hash,
+                    at_hand,
                     why,
                     attempts = attempts.times,
+                    help = HELP,
                     "no node provides the definition of this type"
                 );
                 CachedType::Missing(Missing { attempts, settled: retry == Retry::No, pause: None })
@@ -172,15 +218,23 @@ impl DefinitionsCache {
                             type_name,
                             node, hash, comments, "definitions from a node that writes this type"
                         );
-                        CachedType::Text(text, None)
+                        let found = || CachedType::Text(text.clone(), None, Some(hash.clone()));
+                        // Without a local one, for writers that announce no hash, too.
+                        if at_hand.is_none() {
+                            self.types.insert((query.type_name.clone(), None), found());
+                        }
+                        found()
                     }
                     Err(error) => {
                         let error = visible(&chain(&error));
                         warn!(
                             type_name,
                             node,
+                            announced = hash,
+                            at_hand,
                             error,
                             attempts = attempts.times,
+                            help = HELP,
                             "the definition that a node sent for this type is unusable"
                         );
                         CachedType::Missing(Missing { attempts, ..Missing::default() })
@@ -188,31 +242,34 @@ impl DefinitionsCache {
                 }
             }
         };
-        self.types.insert(query.type_name, entry);
+        self.types.insert((query.type_name, query.type_hash), entry);
     }
 
-    fn entry(&mut self, type_name: &str) -> &mut CachedType {
-        if self.types.len() >= MOST && !self.types.contains_key(type_name) {
+    fn entry(&mut self, type_name: &str, hash: Option<&str>) -> &mut CachedType {
+        let key = (type_name.to_owned(), hash.map(str::to_owned));
+        if self.types.len() >= MOST && !self.types.contains_key(&key) {
             // Forgets names from the network. Types with a text are this vehicle's own, or were
             // queried.
             self.types.retain(|_, entry| {
                 !matches!(entry, CachedType::Missing(missing) if missing.attempts.times == 0)
             });
         }
-        self.types.entry(type_name.to_owned()).or_insert_with(|| {
-            match self.sources.find(type_name) {
-                Ok(Some(text)) => CachedType::Text(text, None),
-                Ok(None) | Err(SourcesError::Name { .. }) => {
-                    CachedType::Missing(Missing::default())
+        self.types.entry(key).or_insert_with(|| match self.sources.find(type_name) {
+            Ok(Some(text)) => {
+                let local = type_hash(type_name, &text).ok();
+                if hash.is_none() || hash == local.as_deref() {
+                    return CachedType::Text(text, None, local);
                 }
-                Err(error) => {
-                    warn!(
-                        type_name,
-                        error = &error as &dyn std::error::Error,
-                        "unusable definition file"
-                    );
-                    CachedType::Missing(Missing::default())
-                }
+                CachedType::Missing(Missing::default())
+            }
+            Ok(None) | Err(SourcesError::Name { .. }) => CachedType::Missing(Missing::default()),
+            Err(error) => {
+                warn!(
+                    type_name,
+                    error = &error as &dyn std::error::Error,
+                    "unusable definition file"
+                );
+                CachedType::Missing(Missing::default())
             }
         })
     }
@@ -227,25 +284,29 @@ mod tests {
         let folder = std::env::temp_dir().join(format!("gleaner-known-{}", std::process::id()));
         std::fs::create_dir_all(&folder).unwrap();
         let mut cache = DefinitionsCache::new(Sources::new(std::slice::from_ref(&folder), &[]));
-        assert_eq!(cache.text("car_msgs/msg/Wheel"), None);
+        assert_eq!(cache.text("car_msgs/msg/Wheel", None), None);
         std::fs::write(folder.join("Wheel.msg"), "float64 bar\n").unwrap();
-        let late = cache.text("car_msgs/msg/Wheel");
-        let again = DefinitionsCache::new(cache.sources.clone()).text("car_msgs/msg/Wheel");
+        let late = cache.text("car_msgs/msg/Wheel", None);
+        let again = DefinitionsCache::new(cache.sources.clone()).text("car_msgs/msg/Wheel", None);
         std::fs::remove_dir_all(&folder).unwrap();
         assert_eq!((late, again.as_deref()), (None, Some("float64 bar\n")));
-        let text = cache.text("std_msgs/msg/String").unwrap();
-        assert!(Arc::ptr_eq(&text, &cache.text("std_msgs/msg/String").unwrap()));
-        let mut parsed = || cache.parsed("std_msgs/msg/String").unwrap().unwrap();
+        let text = cache.text("std_msgs/msg/String", None).unwrap();
+        assert!(Arc::ptr_eq(&text, &cache.text("std_msgs/msg/String", None).unwrap()));
+        let hash = cache.hash_at_hand("std_msgs/msg/String");
+        assert_eq!(cache.text("std_msgs/msg/String", hash.as_deref()), Some(text));
+        assert_eq!(cache.text("std_msgs/msg/String", Some("RIHS01_0")), None);
+        let mut parsed = || cache.parsed("std_msgs/msg/String", None).unwrap().unwrap();
         assert!(Arc::ptr_eq(&parsed(), &parsed()));
     }
 
     #[test]
     fn names_from_the_network_do_not_accumulate() {
         let mut cache = DefinitionsCache::new(Sources::default());
-        assert!(cache.text("std_msgs/msg/String").is_some());
+        assert!(cache.text("std_msgs/msg/String", None).is_some());
         for n in 0..3 * MOST {
-            assert_eq!(cache.text(&format!("car_msgs/msg/T{n}")), None);
+            assert_eq!(cache.text(&format!("car_msgs/msg/T{n}"), Some("RIHS01_0")), None);
         }
-        assert!(cache.types.len() <= MOST && cache.types.contains_key("std_msgs/msg/String"));
+        let string = ("std_msgs/msg/String".to_owned(), None);
+        assert!(cache.types.len() <= MOST && cache.types.contains_key(&string));
     }
 }

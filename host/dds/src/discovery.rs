@@ -8,11 +8,13 @@ use rustdds::{DomainParticipant, RTPSEntity};
 use super::Distro;
 use super::names::{ros_topic, ros_type, visible};
 use super::qos::{Offer, as_rosbag2, describe};
+use super::type_check::LeftOut;
+use super::type_query::type_hash;
 use gleaner_transport::Guid;
 
 /// Most topics that are listed.
 const TOPICS: usize = 4096;
-/// Most different qualities of service that are listed for a topic.
+/// Most different qualities of service, and layouts, that are listed for a topic.
 const QUALITIES: usize = 16;
 
 /// A ROS 2 topic that another participant writes or reads.
@@ -31,6 +33,15 @@ pub struct DomainTopic {
     pub qos: Vec<String>,
 }
 
+/// A topic with further announcements of its writers.
+pub(super) struct ListedTopic {
+    pub(super) shown: DomainTopic,
+    /// The offers in the format of rosbag2.
+    pub(super) offered_qos: Option<String>,
+    /// The distinct hashes of the type.
+    pub(super) type_hashes: Vec<String>,
+}
+
 pub(super) fn offer(writer: &DiscoveredWriterData) -> Offer {
     let data = &writer.publication_topic_data;
     Offer {
@@ -38,17 +49,18 @@ pub(super) fn offer(writer: &DiscoveredWriterData) -> Offer {
         topic: data.topic_name.clone(),
         type_name: data.type_name.clone(),
         qos: data.qos(),
+        type_hash: type_hash(&writer.user_data),
     }
 }
 
 /// The topics of other participants, sorted by name, and under one name by the number of writers,
-/// most first; each with the offers of its writers in the format of rosbag2. If there are too many,
-/// those that are `subscribed`, by their names and types in DDS, are among them.
+/// most first. If there are too many, those that are `subscribed`, by their names and types in DDS,
+/// are among them.
 pub(super) fn topics(
     participant: &DomainParticipant,
     distro: Option<Distro>,
     subscribed: &[(String, String)],
-) -> Vec<(DomainTopic, Option<String>)> {
+) -> Vec<ListedTopic> {
     let own = participant.guid().prefix;
     let writers = participant.discovered_writers();
     let readers = participant.discovered_readers();
@@ -81,7 +93,7 @@ fn sorted<'a>(
     writers: impl Iterator<Item = Offer>,
     readers: impl Iterator<Item = (&'a str, &'a str)>,
     distro: Option<Distro>,
-) -> Vec<(DomainTopic, Option<String>)> {
+) -> Vec<ListedTopic> {
     let mut found: BTreeMap<(String, String), (Vec<Offer>, usize)> = BTreeMap::new();
     let key = |topic: &str, type_name: &str| {
         Some((visible(ros_topic(topic)?), visible(&ros_type(type_name))))
@@ -100,21 +112,32 @@ fn sorted<'a>(
     }
     let shown =
         |((topic, type_name), (offers, readers)): ((String, String), (Vec<Offer>, usize))| {
-            let mut qos: Vec<String> = Vec::new();
-            for text in offers.iter().map(|offer| describe(&offer.qos)) {
-                if qos.len() < QUALITIES && !qos.contains(&text) {
-                    qos.push(text);
-                }
-            }
-            let offered = as_rosbag2(&offers.iter().collect::<Vec<_>>(), distro);
-            (DomainTopic { topic, type_name, writers: offers.len(), readers, qos }, offered)
+            let qos = distinct(offers.iter().map(|offer| match LeftOut::unmatched(offer) {
+                None => describe(&offer.qos),
+                Some(LeftOut::Key) => describe(&offer.qos) + ", with a key: not received",
+                Some(_) => format!("{}, {}: not received", describe(&offer.qos), offer.encoding()),
+            }));
+            let offered_qos = as_rosbag2(&offers.iter().collect::<Vec<_>>(), distro);
+            let type_hashes = distinct(offers.iter().filter_map(|offer| offer.type_hash.clone()));
+            let shown = DomainTopic { topic, type_name, writers: offers.len(), readers, qos };
+            ListedTopic { shown, offered_qos, type_hashes }
         };
     let mut topics: Vec<_> = found.into_iter().map(shown).collect();
     // A participant that announces a topic with a wrong type must not displace the real one.
-    topics.sort_by(|(one, _), (other, _)| {
+    topics.sort_by(|ListedTopic { shown: one, .. }, ListedTopic { shown: other, .. }| {
         one.topic.cmp(&other.topic).then(other.writers.cmp(&one.writers))
     });
     topics
+}
+
+fn distinct(texts: impl Iterator<Item = String>) -> Vec<String> {
+    let mut distinct: Vec<String> = Vec::new();
+    for text in texts {
+        if distinct.len() < QUALITIES && !distinct.contains(&text) {
+            distinct.push(text);
+        }
+    }
+    distinct
 }
 
 #[cfg(test)]
@@ -129,6 +152,7 @@ mod tests {
             topic: topic.to_owned(),
             type_name: type_name.to_owned(),
             qos,
+            type_hash: None,
         }
     }
 
@@ -140,13 +164,13 @@ mod tests {
         let writers = writers.iter().chain(&writers).cloned();
         let readers = [("rt/a", imu), ("rt/c", "x"), ("rq/service", imu)];
         let topics = sorted(writers, readers.into_iter(), None);
-        let names: Vec<_> = topics.iter().map(|(topic, _)| topic.topic.as_str()).collect();
+        let names: Vec<_> = topics.iter().map(|listed| listed.shown.topic.as_str()).collect();
         assert_eq!(names, ["/a", "/b", "/c"]);
-        let (a, offered) = &topics[0];
+        let ListedTopic { shown: a, offered_qos: offered, .. } = &topics[0];
         assert_eq!((a.type_name.as_str(), a.writers, a.readers), ("sensor_msgs/msg/Imu", 4, 1));
         assert_eq!(a.qos, ["reliable, volatile", "best effort, volatile"]);
         assert_eq!(offered.as_ref().unwrap().matches("- history").count(), 4);
-        assert_eq!(topics[2].1, None);
+        assert_eq!(topics[2].offered_qos, None);
     }
 
     #[test]
@@ -155,8 +179,8 @@ mod tests {
             ["aaa::msg::dds_::X_", "sensor_msgs::msg::dds_::Imu_", "sensor_msgs::msg::dds_::Imu_"];
         let writers = types.map(|type_name| offer("rt/imu", type_name, true));
         let topics = sorted(writers.into_iter(), [("rt/imu", "a")].into_iter(), None);
-        let types: Vec<_> =
-            topics.iter().map(|(topic, _)| (topic.type_name.as_str(), topic.writers)).collect();
+        let shown = topics.iter().map(|listed| &listed.shown);
+        let types: Vec<_> = shown.map(|topic| (topic.type_name.as_str(), topic.writers)).collect();
         assert_eq!(types, [("sensor_msgs/msg/Imu", 2), ("aaa/msg/X", 1), ("a", 0)]);
     }
 
@@ -166,7 +190,8 @@ mod tests {
         assert_eq!(sorted(writers.clone(), std::iter::empty(), None).len(), TOPICS);
         let subscribed = [("rt/t9999".to_owned(), "x".to_owned())];
         let topics = sorted(subscribed_first(writers, &subscribed), std::iter::empty(), None);
-        assert!(topics.iter().any(|(topic, _)| topic.topic == "/t9999") && topics.len() == TOPICS);
+        assert!(topics.iter().any(|found| found.shown.topic == "/t9999"));
+        assert_eq!(topics.len(), TOPICS);
     }
 
     #[test]
@@ -174,7 +199,7 @@ mod tests {
         let topics =
             sorted([offer("rt/\u{1b}[2J", "\n", true)].into_iter(), std::iter::empty(), None);
         assert_eq!(
-            (topics[0].0.topic.as_str(), topics[0].0.type_name.as_str()),
+            (topics[0].shown.topic.as_str(), topics[0].shown.type_name.as_str()),
             ("/\\u{1b}[2J", "\\u{a}")
         );
     }

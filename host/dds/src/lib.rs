@@ -65,12 +65,13 @@ pub use writer::TopicWriter;
 
 use announcer::{Announcements, Announcer};
 use definitions_cache::DefinitionsCache;
+use discovery::ListedTopic;
 use gleaner_base::text::nearest;
 use gleaner_messages::{Definitions, Sources};
 use gleaner_protocol::NetworkStatus;
 use gleaner_transport::{
     DefinitionsSearch, DiscoveredTopic, Health, LiveSource, PublishError, Publisher,
-    ReceptionStatus, Sink, Subscription, TopicSpec, Transport, TransportError,
+    ReceptionStatus, Sink, Subscription, TopicSpec, Transport, TransportError, same_type,
 };
 use joins::NoJoin;
 use packet_filter::PacketFilter;
@@ -79,6 +80,7 @@ use signal_mask::SignalMask;
 use sockets::Sockets;
 use state::{ParticipantState, SubscriptionStatus, lock};
 use topic_reader::TopicReader;
+use type_check::TopicLayout;
 use watchdog::Watchdog;
 
 /// The receive buffer of a socket has room for this many of the largest samples, up to
@@ -192,10 +194,51 @@ impl Dds {
 
     /// The ROS 2 topics that other participants write or read, sorted by name; at most 4096.
     pub fn discovered(&self) -> Vec<DomainTopic> {
-        discovery::topics(&self.participant, None, &[])
-            .into_iter()
-            .map(|(topic, _)| topic)
-            .collect()
+        let listed = discovery::topics(&self.participant, None, &[]);
+        listed.into_iter().map(|listed| listed.shown).collect()
+    }
+
+    /// The hash (RIHS01) of the layout in which a topic is received: that of its subscription, else
+    /// the one of the definition at hand, else any of those that its writers announce. `None` if
+    /// they announce none, as up to Humble.
+    pub fn type_hash(&self, topic: &str) -> Option<String> {
+        let type_name = self.type_of(topic).ok()?;
+        let listed = discovery::topics(&self.participant, None, &[]);
+        let is_it =
+            |shown: &DomainTopic| shown.topic == topic && same_type(&shown.type_name, &type_name);
+        let found = listed.into_iter().find(|listed| is_it(&listed.shown));
+        let announced = found.map(|listed| listed.type_hashes).unwrap_or_default();
+        self.layout_of(topic, &type_name, &announced, &mut lock(&self.definitions))
+    }
+
+    /// Fixes the layout of a subscription to that of the definitions that its readers use: samples
+    /// of writers that announce another one are left out.
+    ///
+    /// # Errors
+    ///
+    /// The hash to which a writer, or an earlier call, has fixed it.
+    pub fn fix_layout(&self, subscription: Subscription, type_hash: &str) -> Result<(), String> {
+        match self.subscriptions.get(&subscription.0).map(|(_, status)| &status.layout) {
+            Some(layout) if !layout.fix(type_hash) => Err(layout.get().unwrap_or_default().into()),
+            _ => Ok(()),
+        }
+    }
+
+    fn layout_of(
+        &self,
+        topic: &str,
+        type_name: &str,
+        announced: &[String],
+        definitions: &mut DefinitionsCache,
+    ) -> Option<String> {
+        let is_it = |spec: &TopicSpec| spec.topic == topic && same_type(&spec.type_name, type_name);
+        let mut subscribed = self.subscriptions.values().filter(|(spec, _)| is_it(spec));
+        if let Some(fixed) = subscribed.find_map(|(_, status)| status.layout.get()) {
+            return Some(fixed.to_owned());
+        }
+        let at_hand = definitions.hash_at_hand(type_name);
+        TopicLayout::choose(at_hand.as_deref(), announced.iter().map(String::as_str))
+            .map(str::to_owned)
     }
 
     /// The type of a topic: as it is subscribed, else as others write or read it.
@@ -235,15 +278,22 @@ impl Transport for Dds {
         };
         let subscribed: Vec<_> = self.subscriptions.values().filter_map(in_dds).collect();
         let topics = discovery::topics(&self.participant, self.state.graph().1, &subscribed);
-        let discovered = |(found, offered_qos): (DomainTopic, Option<String>)| DiscoveredTopic {
-            definitions_text: lock(&self.definitions).text(&found.type_name),
-            topic: found.topic,
-            type_name: found.type_name,
-            messages: None,
-            offered_qos,
+        let discovered = |ListedTopic { shown, offered_qos, type_hashes }| {
+            let DomainTopic { topic, type_name, .. } = shown;
+            let mut definitions = lock(&self.definitions);
+            let layout = self.layout_of(&topic, &type_name, &type_hashes, &mut definitions);
+            DiscoveredTopic {
+                definitions_text: definitions.text(&type_name, layout.as_deref()),
+                type_hash: layout,
+                topic,
+                type_name,
+                messages: None,
+                offered_qos,
+                other_definitions: Vec::new(),
+            }
         };
         // A topic that is only read delivers nothing, and its readers may have another type.
-        topics.into_iter().filter(|(found, _)| found.writers > 0).map(discovered).collect()
+        topics.into_iter().filter(|found| found.shown.writers > 0).map(discovered).collect()
     }
 
     /// As for every transport, but a topic without a writer can be subscribed. Names that are not
@@ -253,7 +303,14 @@ impl Transport for Dds {
         spec: &TopicSpec,
         sink: Arc<dyn Sink>,
     ) -> Result<Subscription, TransportError> {
-        let status = Arc::new(SubscriptionStatus::default());
+        let at_hand = lock(&self.definitions).hash_at_hand(&spec.type_name);
+        // Readers that come before all writers use the definition at hand.
+        let fixed = self.type_hash(&spec.topic).is_none().then(|| at_hand.clone()).flatten();
+        let layout = TopicLayout::new(at_hand);
+        if let Some(fixed) = fixed {
+            layout.fix(&fixed);
+        }
+        let status = Arc::new(SubscriptionStatus { layout, ..SubscriptionStatus::default() });
         let index = self.next;
         let Some(reader) = TopicReader::new(index, spec, sink, status.clone()) else {
             let (topic, type_name) = (names::visible(&spec.topic), names::visible(&spec.type_name));
@@ -271,7 +328,8 @@ impl Transport for Dds {
     fn definitions(&self, topic: &str) -> Result<Arc<Definitions>, TransportError> {
         let type_name = self.type_of(topic)?;
         let bad = |source| TransportError::BadDefinitions { topic: topic.to_owned(), source };
-        let known = lock(&self.definitions).parsed(&type_name).map_err(bad)?;
+        let layout = self.type_hash(topic);
+        let known = lock(&self.definitions).parsed(&type_name, layout.as_deref()).map_err(bad)?;
         known.ok_or_else(|| TransportError::NoDefinitions { topic: topic.to_owned(), type_name })
     }
 

@@ -1,9 +1,12 @@
 //! Converts names between ROS 2 and DDS, and makes names from the network printable.
 
-use ros2_client::{MessageTypeName, Name, NodeName};
+use ros2_client::{Name, NodeName};
 
 /// The longest name that is shown, in bytes. ROS 2's own topics may have 255.
 const LONGEST: usize = 256;
+/// The kinds of types that topics have: goals, results and feedback of actions are `action`, events
+/// of services `srv`.
+const KINDS: [&str; 3] = ["msg", "srv", "action"];
 
 /// The DDS name of a topic: `rt/camera/front` for `/camera/front`. `None` if it is not an absolute
 /// topic name.
@@ -13,16 +16,18 @@ pub(super) fn dds_topic(topic: &str) -> Option<String> {
     Some(name.to_dds_name("rt", &root, "")).filter(|name| name.len() <= LONGEST)
 }
 
-/// The DDS name of a message type: `sensor_msgs::msg::dds_::Imu_` for `sensor_msgs/msg/Imu`. `None`
-/// if it is not a valid type name.
+/// The DDS name of a type: `sensor_msgs::msg::dds_::Imu_` for `sensor_msgs/msg/Imu`. `None` if it
+/// is not a valid type name.
 pub(super) fn dds_type(type_name: &str) -> Option<String> {
-    let (package, name) = type_name.split_once("/msg/").or_else(|| type_name.split_once('/'))?;
+    let (package, name) = type_name.split_once('/')?;
+    let (kind, name) = name.split_once('/').unwrap_or(("msg", name));
     let is_name = |part: &str| {
         part.starts_with(|c: char| c.is_ascii_alphabetic())
             && part.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
             && part.len() <= LONGEST / 2
     };
-    (is_name(package) && is_name(name)).then(|| MessageTypeName::new(package, name).dds_msg_type())
+    (is_name(package) && KINDS.contains(&kind) && is_name(name))
+        .then(|| format!("{package}::{kind}::dds_::{name}_"))
 }
 
 /// The ROS 2 name of a topic: `/camera/front` for `rt/camera/front`. `None` for other topics, such
@@ -35,8 +40,10 @@ pub(super) fn ros_topic(dds_name: &str) -> Option<&str> {
 /// type unchanged.
 pub(super) fn ros_type(dds_type: &str) -> String {
     let parts = || {
-        let (package, name) = dds_type.split_once("::msg::dds_::")?;
-        Some(format!("{package}/msg/{}", name.strip_suffix('_')?))
+        let (package, rest) = dds_type.split_once("::")?;
+        let (kind, name) = rest.split_once("::dds_::")?;
+        let name = name.strip_suffix('_').filter(|_| KINDS.contains(&kind))?;
+        Some(format!("{package}/{kind}/{name}"))
     };
     parts().unwrap_or_else(|| dds_type.to_owned())
 }
@@ -82,6 +89,9 @@ mod tests {
             assert_eq!(dds, "sensor_msgs::msg::dds_::Imu_");
             assert_eq!(ros_type(&dds), "sensor_msgs/msg/Imu");
         }
+        let action = dds_type("nav2_msgs/action/Spin_FeedbackMessage").unwrap();
+        assert_eq!(action, "nav2_msgs::action::dds_::Spin_FeedbackMessage_");
+        assert_eq!(ros_type(&action), "nav2_msgs/action/Spin_FeedbackMessage");
     }
 
     #[test]

@@ -6,6 +6,7 @@ use std::ops::RangeBounds;
 use rustdds::{DomainParticipantStatusEvent as Event, GUID};
 
 use super::filter::Prefix;
+use gleaner_transport::Guid;
 
 /// Most participants, and most matches of one local endpoint, that are tracked.
 const MOST: usize = 4096;
@@ -84,6 +85,12 @@ impl Peers {
     /// Number of matches of a local endpoint.
     pub(super) fn connected(&self, own: GUID) -> usize {
         self.matched.get(&own).map_or(0, HashSet::len)
+    }
+
+    /// The same without those that are left out.
+    pub(super) fn connected_but(&self, own: GUID, left_out: &HashSet<Guid>) -> usize {
+        let counts = |their: &&GUID| !left_out.contains(&Guid(their.to_bytes()));
+        self.matched.get(&own).map_or(0, |matched| matched.iter().filter(counts).count())
     }
 
     pub(super) fn participants(&self) -> usize {

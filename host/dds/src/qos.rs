@@ -2,7 +2,11 @@
 
 use std::fmt::{self, Write as _};
 
-use rustdds::policy::{Deadline, Durability, History, Liveliness, Reliability, ResourceLimits};
+use rustdds::policy::{
+    self, DataRepresentation, Deadline, Durability, History, Liveliness, Reliability,
+    ResourceLimits,
+};
+use rustdds::qos::QosPolicyId;
 use rustdds::{Duration, QosPolicies, QosPolicyBuilder};
 
 use super::Distro;
@@ -27,6 +31,30 @@ pub(super) struct Offer {
     /// The DDS name.
     pub(super) type_name: String,
     pub(super) qos: QosPolicies,
+    /// The hash of its type, if it announces one.
+    pub(super) type_hash: Option<String>,
+}
+
+impl Offer {
+    /// The encoding of its samples.
+    pub(super) fn encoding(&self) -> &'static str {
+        match DataRepresentation::offered_representation(self.qos.data_representation().as_ref()) {
+            policy::XCDR_DATA_REPRESENTATION => "XCDR1",
+            policy::XML_DATA_REPRESENTATION => "XML",
+            policy::XCDR2_DATA_REPRESENTATION => "XCDR2",
+            _ => "an unknown encoding",
+        }
+    }
+
+    /// Compares the offer with a request that it does not satisfy, by the policy that differs.
+    pub(super) fn shortfall(&self, request: Request) -> Option<String> {
+        let policy = self.qos.compliance_failure_wrt(&request.policies(1))?;
+        Some(match policy {
+            QosPolicyId::Reliability => "best effort, but reliable is requested".to_owned(),
+            QosPolicyId::Durability => "volatile, but transient local is requested".to_owned(),
+            _ => format!("{policy:?} that is incompatible with the default, which is requested"),
+        })
+    }
 }
 
 impl Request {
@@ -155,7 +183,8 @@ mod tests {
 
     fn offer(reliable: bool, transient_local: bool) -> Offer {
         let qos = Request { reliable, transient_local }.policies(1);
-        Offer { guid: Guid::default(), topic: String::new(), type_name: String::new(), qos }
+        let (topic, type_name) = (String::new(), String::new());
+        Offer { guid: Guid::default(), topic, type_name, qos, type_hash: None }
     }
 
     #[test]

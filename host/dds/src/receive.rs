@@ -319,7 +319,7 @@ impl Receiver {
         // Register new participants before reading their graph messages.
         self.graph.nodes().keep(&others);
         self.graph.receive(&context);
-        self.querier.poll(&context, ANSWER, &writers, self.graph.nodes());
+        self.querier.poll(&context, ANSWER, &offers, self.graph.nodes());
         // An open query is polled again soon.
         self.changed |= self.querier.is_open();
         let readers = self.readers.values().filter_map(TopicReader::guid).collect();

@@ -8,9 +8,10 @@ use rustdds::GUID;
 use tracing::error;
 
 use super::peers::Peers;
+use super::type_check::TopicLayout;
 use super::type_query::QueryOutcome;
 use super::{Distro, names};
-use gleaner_transport::ReceptionStatus;
+use gleaner_transport::{Guid, ReceptionStatus};
 
 /// A count that is unknown.
 pub(super) const UNKNOWN: u64 = u64::MAX;
@@ -41,6 +42,7 @@ pub(super) struct SubscriptionStatus {
     /// [`UNKNOWN`] if it is unknown.
     pub(super) before_match: AtomicU64,
     pub(super) malformed: AtomicU64,
+    pub(super) layout: TopicLayout,
     pub(super) text: Mutex<StatusText>,
 }
 
@@ -49,6 +51,8 @@ pub(super) struct StatusText {
     pub(super) reader: Option<GUID>,
     pub(super) qos: Option<String>,
     pub(super) qos_warnings: Vec<String>,
+    /// Writers that do not count as connected, though RustDDS may take them as matched.
+    pub(super) left_out: HashSet<Guid>,
 }
 
 /// Locks `mutex` even after a panic: the state stays valid.
@@ -114,7 +118,9 @@ impl SubscriptionStatus {
     pub(super) fn status(&self, state: &ParticipantState) -> ReceptionStatus {
         let text = lock(&self.text);
         ReceptionStatus {
-            writers: Some(text.reader.map_or(0, |reader| state.peers().connected(reader))),
+            writers: Some(
+                text.reader.map_or(0, |reader| state.peers().connected_but(reader, &text.left_out)),
+            ),
             lost: Some(self.lost.load(Ordering::Relaxed)),
             before_match: Some(self.before_match.load(Ordering::Relaxed))
                 .filter(|count| *count != UNKNOWN),

@@ -12,11 +12,11 @@ use rustdds::{DomainParticipant, GUID, RTPSEntity, Timestamp, TopicKind};
 use tracing::{info, warn};
 
 use super::before_match::BeforeMatch;
-use super::names::{dds_topic, dds_type, ros_type, visible};
+use super::names::{dds_topic, dds_type, visible};
 use super::qos::{Offer, Request, describe};
 use super::raw::{CopiedTo, CopyInto, CopyOrReport, Raw, RawReader};
 use super::state::{OnceLog, ParticipantState, SubscriptionStatus, UNKNOWN, lock, panic_text};
-use super::type_check::TypeCheck;
+use super::type_check::{LeftOut, TypeCheck};
 use gleaner_transport::{Clock, Gaps, Guid, Qos, SampleMeta, Sink, TopicSpec};
 
 /// Memory and number of samples that RustDDS may keep for a topic: it frees a sample when newer
@@ -26,8 +26,8 @@ const KEPT: std::ops::RangeInclusive<usize> = 4..=1024;
 /// Hard caps on the queue, whatever the subscription requests.
 const MOST_KEPT_BYTES: usize = 1 << 30;
 const MOST_KEPT: usize = 65_536;
-/// Most warnings in the status, and most past re-subscriptions among them.
-const MOST_WARNINGS: usize = 12;
+/// Most warnings about writers in the status, and most past re-subscriptions besides.
+const MOST_WARNINGS: usize = 10;
 const MOST_RESUBSCRIBED: usize = 4;
 
 /// The token of the first reader.
@@ -180,10 +180,11 @@ impl TopicReader {
                 Ok(Some(change)) => {
                     let writer = Guid(change.writer_guid.to_bytes());
                     let seq = u64::try_from(i64::from(change.sequence_number)).unwrap_or(0).max(1);
-                    let other = self.type_check.is_of_another_type(
+                    let other = self.type_check.skips(
                         context.participant,
                         writer,
                         &self.type_name,
+                        &self.status.layout,
                     );
                     let is_new = change.receive_instant >= self.not_before
                         && !self.read_before.has(writer, seq);
@@ -234,6 +235,8 @@ impl TopicReader {
             seq,
             endian: raw.endian,
             options: [0; 2],
+            layout: 0,
+            is_latched: false,
         };
         if let Some(before) = &mut self.before_match {
             before.note(&meta);
@@ -271,8 +274,7 @@ impl TopicReader {
     /// Requests the QoS that all current writers offer, and updates the status.
     pub(super) fn update(&mut self, context: &ReceiveContext<'_>, offers: &[Offer]) {
         let here: Vec<&Offer> = offers.iter().filter(|offer| offer.topic == self.topic).collect();
-        let (same, others): (Vec<&Offer>, Vec<&Offer>) =
-            here.into_iter().partition(|offer| offer.type_name == self.type_name);
+        let (same, others) = self.type_check.note(&here, &self.type_name, &self.status.layout);
         let wanted = match self.spec.qos {
             Qos::Fixed { reliable, transient_local, .. } => {
                 Some(Request { reliable, transient_local })
@@ -292,7 +294,6 @@ impl TopicReader {
             }
         }
         self.without_writers = same.is_empty();
-        self.type_check.note(&same, &others);
         let clock = context.clock;
         let before = self.before_match.get_or_insert_with(|| BeforeMatch::new(clock.now()));
         before.make_room(|writer| same.iter().any(|offer| offer.guid == *writer));
@@ -308,31 +309,26 @@ impl TopicReader {
             self.request.filter(|_| self.reader.is_some()).map(|request| request.to_string());
         text.qos_warnings = qos_warnings.into_iter().map(|(_, sentence)| sentence).collect();
         text.qos_warnings.extend_from_slice(&self.resubscribed);
-        text.qos_warnings.extend(self.type_check.warning(&self.spec.topic));
+        text.qos_warnings.extend(self.type_check.warnings(&self.spec.topic));
+        text.left_out = others.iter().map(|(offer, _)| offer.guid).collect();
     }
 
     /// Warnings about writers whose samples are not received, or not with the QoS they offer:
     /// cause, and sentence.
-    fn qos_warnings(&self, same: &[&Offer], others: &[&Offer]) -> Vec<(&'static str, String)> {
+    fn qos_warnings(
+        &self,
+        same: &[&Offer],
+        others: &[(&Offer, LeftOut)],
+    ) -> Vec<(&'static str, String)> {
         let topic = &self.spec.topic;
-        let of_another_type = others.iter().map(|offer| {
-            let (found, wanted) = (visible(&ros_type(&offer.type_name)), ros_type(&self.type_name));
-            (
-                "another type",
-                format!("writer {} of `{topic}` sends `{found}`, not `{wanted}`", offer.guid),
-            )
-        });
-        let mut qos_warnings: Vec<_> = of_another_type.take(MOST_WARNINGS / 2).collect();
+        let left_out = others
+            .iter()
+            .map(|(offer, why)| why.warning(offer, (topic, &self.type_name), &self.status.layout));
+        let mut qos_warnings: Vec<_> = left_out.take(MOST_WARNINGS / 2).collect();
         let Some(request) = self.request else { return qos_warnings };
-        let policies = request.policies(1);
         for offer in same {
-            if let Some(policy) = offer.qos.compliance_failure_wrt(&policies) {
-                let offered = describe(&offer.qos);
-                let sentence = format!(
-                    "writer {} of `{topic}` offers {offered}, but {request} is requested: \
-                     {policy:?} is incompatible",
-                    offer.guid
-                );
+            if let Some(shortfall) = offer.shortfall(request) {
+                let sentence = format!("writer {} of `{topic}` offers {shortfall}", offer.guid);
                 qos_warnings.push(("offers less", sentence));
             }
         }

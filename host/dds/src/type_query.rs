@@ -17,7 +17,6 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use mio::{Interest, Token};
 use rustdds::dds::CreateError;
-use rustdds::discovery::DiscoveredWriterData;
 use rustdds::{
     DomainParticipant, QosPolicyBuilder, RTPSEntity, SampleIdentity, SequenceNumber, TopicKind,
     WriteOptionsBuilder, policy,
@@ -26,7 +25,7 @@ use rustdds::{
 use super::names::{dds_topic, dds_type, visible};
 use super::nodes::Nodes;
 use super::peers::prefix;
-use super::qos::Request;
+use super::qos::{Offer, Request};
 use super::raw::{CopyInto, RawReader, RawWriter};
 use super::topic_reader::ReceiveContext;
 use gleaner_messages::Endian;
@@ -52,6 +51,8 @@ pub(super) struct TypeQuery {
     /// Distinguishes its outcome from that of an earlier query.
     pub(super) ticket: u64,
     pub(super) type_name: String,
+    /// The hash that the type must have, if its writers announce any.
+    pub(super) type_hash: Option<String>,
     pub(super) before: Attempts,
 }
 
@@ -137,11 +138,11 @@ impl TypeQuerier {
         &mut self,
         context: &ReceiveContext<'_>,
         token: Token,
-        writers: &[DiscoveredWriterData],
+        offers: &[Offer],
         nodes: &Nodes,
     ) {
         let Some(open) = &mut self.open else { return };
-        let mut outcome = open.proceed(context, token, writers, nodes);
+        let mut outcome = open.proceed(context, token, offers, nodes);
         if outcome.is_none() && open.begun.elapsed() >= LIMIT {
             let (why, retry) = open.missing.clone();
             outcome = Some(QueryOutcome::Failed { why, retry });
@@ -160,11 +161,11 @@ impl OpenQuery {
         &mut self,
         context: &ReceiveContext<'_>,
         token: Token,
-        writers: &[DiscoveredWriterData],
+        offers: &[Offer],
         nodes: &Nodes,
     ) -> Option<QueryOutcome> {
         if self.call.is_none() {
-            match target(&self.query, writers, nodes)
+            match target(&self.query, offers, nodes)
                 .and_then(|target| ServiceCall::create(context, token, &self.query, target))
             {
                 Ok(call) => self.call = Some(call),
@@ -201,27 +202,23 @@ enum NoTarget {
 }
 
 /// Chooses the node: each time another one, if several write the type.
-fn target(
-    query: &TypeQuery,
-    writers: &[DiscoveredWriterData],
-    nodes: &Nodes,
-) -> Result<QueryTarget, NoTarget> {
+fn target(query: &TypeQuery, offers: &[Offer], nodes: &Nodes) -> Result<QueryTarget, NoTarget> {
     let yet = |why: &str| NoTarget::Yet(why.to_owned());
     let type_name =
         dds_type(&query.type_name).ok_or_else(|| NoTarget::Ever("not a ROS 2 type".to_owned()))?;
-    let of_type =
-        || writers.iter().filter(|writer| writer.publication_topic_data.type_name == type_name);
-    if of_type().next().is_none() {
+    let mut of_type = offers.iter().filter(|offer| offer.type_name == type_name).peekable();
+    if of_type.peek().is_none() {
         return Err(yet("no writer of the type is known"));
     }
     let announced: Vec<_> =
-        of_type().filter_map(|writer| Some((writer, type_hash(&writer.user_data)?))).collect();
+        of_type.filter_map(|offer| Some((offer.guid, offer.type_hash.clone()?))).collect();
     if announced.is_empty() {
         let why = "its writers do not announce the type's hash, as nodes of Iron and newer do";
         return Err(NoTarget::Ever(why.to_owned()));
     }
-    let target = announced.into_iter().filter_map(|(writer, hash)| {
-        let writer = Guid(writer.writer_proxy.remote_writer_guid.to_bytes());
+    let is_wanted = |hash: &String| query.type_hash.as_ref().is_none_or(|wanted| wanted == hash);
+    let wanted = announced.into_iter().filter(|(_, hash)| is_wanted(hash));
+    let target = wanted.filter_map(|(writer, hash)| {
         Some(QueryTarget { node: nodes.writing(writer)?.to_owned(), hash, writer })
     });
     let mut target: Vec<QueryTarget> = target.collect();
@@ -235,7 +232,7 @@ fn target(
 
 /// Parses the hash of a writer's type from the user data that nodes of Iron and newer announce with
 /// a writer: `typehash=RIHS01_…;`.
-fn type_hash(user_data: &[u8]) -> Option<String> {
+pub(super) fn type_hash(user_data: &[u8]) -> Option<String> {
     const KEY: &[u8] = b"typehash=";
     const HASH: usize = "RIHS01_".len() + 64;
     let at = user_data.windows(KEY.len()).position(|window| window == KEY)?;

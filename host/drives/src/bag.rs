@@ -44,7 +44,7 @@ pub(super) fn list(folder: &Path) -> Result<Bag, ReplayError> {
              `{first}`"
         )
     });
-    Ok(Bag { files, messages: found.messages, remark })
+    Ok(Bag { files, messages: found.messages, is_one: true, remark })
 }
 
 /// Reads the text of the file `path`, which must be in the folder `root`.

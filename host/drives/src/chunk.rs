@@ -48,6 +48,9 @@ pub(super) struct OpenSegment {
     len: usize,
     entries: Vec<MessageEntry>,
     next: usize,
+    /// The channels of messages that were left out, as their time is beyond the year 2262; one
+    /// entry for each message.
+    late: Vec<u16>,
 }
 
 impl OpenSegment {
@@ -104,6 +107,11 @@ impl OpenSegment {
         self.entries.push(MessageEntry { log_time: head.log_time, channel: 0, at });
     }
 
+    /// Takes the channels of messages whose time is too late; one entry for each message.
+    pub(super) fn take_late(&mut self) -> Vec<u16> {
+        std::mem::take(&mut self.late)
+    }
+
     /// Collects the messages of the channels that `wanted` accepts, and sorts them. The times of
     /// `segment` and the `channels` of the file are checked.
     ///
@@ -118,6 +126,7 @@ impl OpenSegment {
         let mut entries = std::mem::take(&mut self.entries);
         entries.clear();
         self.next = 0;
+        let mut late = Vec::new();
         for record in self.records() {
             let McapRecord { opcode, at, body } = record?;
             if opcode != op::MESSAGE {
@@ -129,9 +138,12 @@ impl OpenSegment {
                 let (first, last) = (segment.start_time, segment.end_time);
                 return Err(Damage::OutsideChunk { found: head.log_time, first, last });
             }
-            if wanted(head.channel).ok_or(Damage::UnknownChannel(head.channel))?
-                && span.holds(head.log_time)
-            {
+            if !wanted(head.channel).ok_or(Damage::UnknownChannel(head.channel))? {
+                continue;
+            }
+            if i64::try_from(head.log_time).is_err() {
+                late.push(head.channel);
+            } else if span.holds(head.log_time) {
                 // It fits: `Opener::new` limits the size of a segment.
                 entries.push(MessageEntry {
                     log_time: head.log_time,
@@ -143,20 +155,14 @@ impl OpenSegment {
         if !entries.is_sorted() {
             entries.sort_unstable();
         }
-        self.entries = entries;
+        (self.entries, self.late) = (entries, late);
         Ok(())
     }
 }
 
-/// Parses the header of a message record. Times are signed everywhere else: one that does not fit
-/// is damage.
+/// Parses the header of a message record.
 pub(super) fn message_head(body: &[u8]) -> Result<MessageHead, Damage> {
-    let head = MessageHead::parse(body)
-        .ok_or(Damage::Malformed("a message record is shorter than its header"))?;
-    if i64::try_from(head.log_time).is_err() {
-        return Err(Damage::Late(head.log_time));
-    }
-    Ok(head)
+    MessageHead::parse(body).ok_or(Damage::Malformed("a message record is shorter than its header"))
 }
 
 /// Reads segments; keeps the decompressor's state between them.

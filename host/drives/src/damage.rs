@@ -48,9 +48,6 @@ pub enum Damage {
         /// First and second value of the field, if they are names; long ones are truncated.
         values: Option<Box<[String; 2]>>,
     },
-    /// A message has a log time beyond the range of the clocks.
-    #[error("a message has log time {0} ns, which is after the year 2262")]
-    Late(u64),
     /// A message has a log time outside the times of its chunk in the index.
     #[error(
         "a message has log time {found} ns; by its index, the chunk holds {first} to {last} ns"
@@ -159,14 +156,6 @@ pub enum Damage {
     /// A message has an undefined channel.
     #[error("a message belongs to channel {0}, which is not defined")]
     UnknownChannel(u16),
-    /// A message of a subscribed topic does not begin with a CDR encapsulation.
-    #[error("a message of topic `{topic}` begins with {found:02x?}, which is not plain CDR")]
-    Encapsulation {
-        /// The topic.
-        topic: String,
-        /// First bytes of the message, at most four.
-        found: Vec<u8>,
-    },
     /// The file has another number of messages of a topic than its summary.
     #[error("topic `{topic}` should have {expected} messages; {found} were found")]
     Missing {

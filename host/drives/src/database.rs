@@ -36,6 +36,9 @@ const LARGEST_ROW: u64 = 1 << 30;
 /// Own statements list at most 65536 topics; those of a schema have no reason to be longer.
 const LONGEST_SQL: i32 = 4 << 20;
 
+/// Column with RIHS01 of a type, since ROS 2 Iron.
+const HASH: &str = "type_description_hash";
+
 /// Approximate size of a row, without its texts. A damaged or malicious table may have any number
 /// of rows.
 const ROW_BYTES: usize = 128;
@@ -231,10 +234,12 @@ struct DatabaseTopics {
 fn topics(db: &Connection) -> Result<DatabaseTopics, BoxedError> {
     table(db, "messages", &["topic_id", "timestamp", "data"])?;
     let columns = table(db, "topics", &["id", "name", "type", "serialization_format"])?;
-    let has_qos = columns.iter().any(|column| column == "offered_qos_profiles");
+    let optional = |name| if columns.iter().any(|column| column == name) { name } else { "NULL" };
+    let (qos, hash) = (optional("offered_qos_profiles"), optional(HASH));
     let texts = definitions(db)?;
-    let qos = if has_qos { "offered_qos_profiles" } else { "NULL" };
-    let sql = format!("SELECT id, name, type, serialization_format, {qos} FROM topics NOT INDEXED");
+    let sql = format!(
+        "SELECT id, name, type, serialization_format, {qos}, {hash} FROM topics NOT INDEXED"
+    );
     let mut statement = db.prepare(&sql)?;
     let mut rows = statement.query([])?;
     let (mut found, mut room) = (BTreeMap::<i64, ChannelInfo>::new(), Channels::default());
@@ -244,15 +249,22 @@ fn topics(db: &Connection) -> Result<DatabaseTopics, BoxedError> {
         }
         let (number, topic, type_name): (_, String, String) =
             (row.get(0)?, row.get(1)?, row.get(2)?);
-        let text = texts.get(&type_name);
+        let hash = row.get::<_, Option<String>>(5)?.unwrap_or_default();
+        let texts = texts.get(&type_name).map_or(&[][..], Vec::as_slice);
+        let (text, unknown_layout) = match text_with(texts, &hash) {
+            Ok(text) => (text, None),
+            Err(why) => (None, Some(why)),
+        };
         let info = ChannelInfo {
             offered_qos: offered_qos(&topic, row.get::<_, Option<String>>(4)?.as_deref()),
             topic,
             message_encoding: row.get(3)?,
-            schema_encoding: text.map(|(encoding, _)| encoding.clone()).unwrap_or_default(),
-            definitions_text: text.map(|(_, text)| text.clone()),
+            schema_encoding: text.map(|found| found.encoding.clone()).unwrap_or_default(),
+            definitions_text: text.map(|found| found.text.clone()),
             type_name,
             writer: None,
+            is_latched: false,
+            unknown_layout,
         };
         room.make_room(ROW_BYTES + info.bytes())?;
         if found.insert(number, info).is_some() {
@@ -267,27 +279,56 @@ fn topics(db: &Connection) -> Result<DatabaseTopics, BoxedError> {
     Ok(known)
 }
 
-/// Reads the texts of message definitions by type, each with its encoding. Databases from before
-/// ROS 2 Iron have none.
-fn definitions(db: &Connection) -> Result<HashMap<String, (String, Arc<str>)>, BoxedError> {
+/// A message definition of a database.
+struct DatabaseDefinition {
+    encoding: String,
+    text: Arc<str>,
+    /// RIHS01 of the type; empty if the writer did not know it.
+    hash: String,
+}
+
+/// Returns the definition for a topic that states `hash`, or an empty one.
+fn text_with<'a>(
+    texts: &'a [DatabaseDefinition],
+    hash: &str,
+) -> Result<Option<&'a DatabaseDefinition>, &'static str> {
+    let stated = texts.iter().find(|found| !hash.is_empty() && found.hash == hash);
+    let Some((first, rest)) = texts.split_first().filter(|_| stated.is_none()) else {
+        return Ok(stated);
+    };
+    if !hash.is_empty() && texts.iter().all(|found| !found.hash.is_empty()) {
+        return Err("its database has definitions of its type, but none with the hash it states");
+    }
+    match rest.iter().all(|other| other.text == first.text) {
+        true => Ok(Some(first)),
+        false => Err("its database has several definitions of its type, and it states no hash"),
+    }
+}
+
+/// Reads the message definitions by type. Databases from before ROS 2 Iron have none.
+fn definitions(db: &Connection) -> Result<HashMap<String, Vec<DatabaseDefinition>>, BoxedError> {
     let name = "message_definitions";
     if kind(db, name)?.is_none() {
         return Ok(HashMap::new());
     }
-    table(db, name, &["topic_type", "encoding", "encoded_message_definition"])?;
-    let mut statement = db.prepare(
-        "SELECT topic_type, encoding, encoded_message_definition FROM \
-                    message_definitions NOT INDEXED",
-    )?;
+    let columns = table(db, name, &["topic_type", "encoding", "encoded_message_definition"])?;
+    let hash = if columns.iter().any(|column| column == HASH) { HASH } else { "NULL" };
+    let mut statement = db.prepare(&format!(
+        "SELECT topic_type, encoding, encoded_message_definition, {hash} FROM \
+         message_definitions NOT INDEXED"
+    ))?;
     let mut rows = statement.query([])?;
-    let (mut texts, mut room) = (HashMap::new(), Channels::default());
+    let mut texts: HashMap<_, Vec<_>> = HashMap::new();
+    let mut room = Channels::default();
     while let Some(row) = rows.next()? {
         let (type_name, encoding, text): (String, String, String) =
             (row.get(0)?, row.get(1)?, row.get(2)?);
-        room.make_room(ROW_BYTES + type_name.len() + encoding.len() + text.len())?;
-        let text = text.trim();
+        let hash = row.get::<_, Option<String>>(3)?.unwrap_or_default();
+        let bytes = type_name.len() + encoding.len() + text.len() + hash.len();
+        room.make_room(ROW_BYTES + bytes)?;
+        let text: Arc<str> = text.trim().into();
         if !text.is_empty() {
-            texts.entry(type_name).or_insert_with(|| (encoding, text.into()));
+            texts.entry(type_name).or_default().push(DatabaseDefinition { encoding, text, hash });
         }
     }
     Ok(texts)

@@ -1,8 +1,8 @@
 //! Merges all files of a drive into one sequence of messages.
 
 use std::cmp::Reverse;
-use std::collections::BinaryHeap;
 use std::collections::binary_heap::PeekMut;
+use std::collections::{BTreeMap, BinaryHeap};
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -19,6 +19,7 @@ use gleaner_messages::Definitions;
 use gleaner_transport::{
     Delivery, DiscoveredTopic, Sink, Subscription, TopicSpec, Transport, TransportError,
 };
+use tracing::warn;
 
 /// A drive: one or more files and rosbag2 directories, replayed as one.
 ///
@@ -39,8 +40,10 @@ use gleaner_transport::{
 ///   the damage, and the readable part ends where the damage begins. Every message in that part was
 ///   delivered, in log-time order, and every message of the other files up to the last log time in
 ///   that part.
-/// - A message that is not CDR is damage at its position: every earlier message in the order of
-///   delivery was delivered.
+///
+/// A message that is not plain CDR, or has a log time after the year 2262, is no damage: it is left
+/// out, and counted by [`Replay::malformed`]. The first one of a topic is logged. One that is not
+/// CDR still is a step, of [`Delivery::Malformed`].
 ///
 /// A file that is readable to its end is replayed as a whole and then reported as damaged if it has
 /// no footer, a damaged summary, or another number of messages of a subscribed topic than in its
@@ -78,6 +81,10 @@ pub struct Replay {
     delivered: usize,
     last_at_ns: i64,
     out_of_order: u64,
+    /// Messages that were left out, by topic.
+    malformed: BTreeMap<String, u64>,
+    /// The types of subscribed topics.
+    types: BTreeMap<String, String>,
     progress: Progress,
 }
 
@@ -102,10 +109,9 @@ impl Replay {
     /// # Errors
     ///
     /// [`ReplayError`] if there is no file, one cannot be opened, is of an unknown format or given
-    /// twice, or if they disagree on a topic's type. Damage further inside is reported by
-    /// [`Replay::step`].
+    /// twice. Damage further inside is reported by [`Replay::step`].
     pub fn open(paths: &[PathBuf]) -> Result<Self, ReplayError> {
-        Self::open_as(paths, &DriveOptions::default())
+        Self::open_as(paths, &DriveOptions { merge: true, ..DriveOptions::default() })
     }
 
     /// Opens a drive as [`Replay::open`] does, with other limits.
@@ -114,22 +120,25 @@ impl Replay {
     ///
     /// As [`Replay::open`].
     pub fn open_with(paths: &[PathBuf], limits: DriveLimits) -> Result<Self, ReplayError> {
-        Self::open_as(paths, &DriveOptions { limits, ..DriveOptions::default() })
+        Self::open_as(paths, &DriveOptions { limits, merge: true, ..DriveOptions::default() })
     }
 
     /// Opens a drive as [`Replay::open`] does, with all options.
     ///
     /// # Errors
     ///
-    /// As [`Replay::open`].
+    /// As [`Replay::open`]; [`ReplayError::Overlap`] without [`DriveOptions::merge`].
     pub fn open_as(paths: &[PathBuf], options: &DriveOptions) -> Result<Self, ReplayError> {
         if paths.is_empty() {
             return Err(ReplayError::NoFiles);
         }
         let mut opener = Opener::new(options.limits);
         let tracks = storage::open(paths, options, &mut opener)?;
+        if !options.merge {
+            refuse_overlap(&tracks)?;
+        }
         let files: Vec<_> = tracks.iter().map(Track::path_and_contents).collect();
-        let catalog = Arc::new(Catalog::build(&files, options.sources.clone())?);
+        let catalog = Arc::new(Catalog::build(&files, options.sources.clone()));
         Ok(Self {
             tracks,
             catalog,
@@ -149,6 +158,8 @@ impl Replay {
             delivered: 0,
             last_at_ns: i64::MIN,
             out_of_order: 0,
+            malformed: BTreeMap::new(),
+            types: BTreeMap::new(),
             progress: Progress { done: 0, total: Some(0) },
         })
     }
@@ -181,7 +192,7 @@ impl Replay {
             .head()
             .ok_or(Damage::Malformed("a chunk has no current message"))
             .and_then(|entry| track.route(segment.body(entry), self.delivered, &mut self.inflate));
-        let Routed { subscription, is_last, meta, is_too_big, cdr } = match routed {
+        let Routed { subscription, is_last, meta, is_too_big, is_malformed, cdr } = match routed {
             Ok(routed) => routed,
             Err(what) => {
                 let error = track.damaged(head.offset, what);
@@ -189,7 +200,13 @@ impl Replay {
             }
         };
         let sink = &self.sinks[subscription.0];
-        let delivery = if is_too_big {
+        let delivery = if is_malformed {
+            if self.delivered == 0 {
+                let why = format!("it begins with {:02x?}", &cdr[..cdr.len().min(4)]);
+                leave_out(&mut self.malformed, track, head.channel, &why);
+            }
+            Delivery::Malformed
+        } else if is_too_big {
             sink.too_big(&meta, cdr.len());
             Delivery::TooBig
         } else {
@@ -251,6 +268,12 @@ impl Replay {
     /// The error of [`Transport::subscribe`].
     pub fn can_subscribe(&self, spec: &TopicSpec) -> Result<(), TransportError> {
         self.catalog.select(spec).map(drop)
+    }
+
+    /// Returns the number of messages so far that were left out, for each subscribed topic that has
+    /// some: they are no plain CDR, or their log time is after the year 2262.
+    pub fn malformed(&self) -> &BTreeMap<String, u64> {
+        &self.malformed
     }
 
     /// Returns the progress of the replay.
@@ -327,6 +350,9 @@ impl Replay {
         let track = &mut self.tracks[index];
         let into = &mut self.open[slot];
         let opened = track.open_next(&mut self.opener, into);
+        for channel in into.take_late() {
+            leave_out(&mut self.malformed, track, channel, "its log time is after the year 2262");
+        }
         match (opened, into.head()) {
             (Ok(offset), Some(entry)) => {
                 self.open_bytes += into.len() as u64;
@@ -395,8 +421,11 @@ impl Transport for Replay {
         }
         let selected = self.catalog.select(spec)?;
         let subscription = Subscription(self.sinks.len());
-        for (track, channel) in selected.channels {
-            self.tracks[*track].subscribe(*channel, subscription, spec.max_bytes);
+        for channel in selected.channels {
+            self.tracks[channel.file].subscribe(*channel, subscription, spec.max_bytes);
+        }
+        if self.types.insert(spec.topic.clone(), spec.type_name.clone()).is_none() {
+            self.catalog.warn_of_other_types(spec);
         }
         let expected = self.progress.total.zip(selected.messages);
         self.progress.total = expected.map(|(total, messages)| total.saturating_add(messages));
@@ -405,7 +434,34 @@ impl Transport for Replay {
     }
 
     fn definitions(&self, topic: &str) -> Result<Arc<Definitions>, TransportError> {
-        self.catalog.definitions(topic)
+        self.catalog.definitions(topic, self.types.get(topic).map(String::as_str))
+    }
+}
+
+/// Refuses files of two recordings with the same topic at the same time: its samples would be
+/// mixed.
+fn refuse_overlap(tracks: &[Track]) -> Result<(), ReplayError> {
+    for (index, track) in tracks.iter().enumerate() {
+        for earlier in &tracks[..index] {
+            if let Some(topic) = earlier.overlap(track) {
+                let [first, second] = [earlier, track].map(|of| of.path_and_contents().0.into());
+                return Err(ReplayError::Overlap { topic: topic.to_owned(), first, second });
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Counts a message that is left out, and names the first one of its topic.
+fn leave_out(counts: &mut BTreeMap<String, u64>, track: &mut Track, channel: u16, why: &str) {
+    let topic = track.leave_out(channel);
+    let path = track.path_and_contents().0.display();
+    match counts.get_mut(&topic) {
+        Some(count) => *count += 1,
+        None => {
+            warn!(%path, topic, why, "a message is left out; further ones of its topic are counted");
+            counts.insert(topic, 1);
+        }
     }
 }
 

@@ -63,6 +63,12 @@ pub enum ReplayError {
         /// The file.
         path: PathBuf,
     },
+    /// The file has no content.
+    #[error("`{path}` is empty: its recorder was ended before it wrote anything")]
+    Empty {
+        /// The file.
+        path: PathBuf,
+    },
     /// The file has no known format.
     #[error(
         "`{path}` is not an MCAP file, nor a rosbag2 database, nor one of them packed with zstd"
@@ -144,21 +150,15 @@ pub enum ReplayError {
         /// Kind of the file or directory.
         what: &'static str,
     },
-    /// Two files, or two channels of a file, disagree on the type of a topic.
-    #[error(
-        "topic `{topic}` has type `{first_type}` in `{first}` and `{second_type}` in `{second}`"
-    )]
-    TypeConflict {
-        /// The topic.
+    /// Two recordings have the same topic at the same time.
+    #[error("`{first}` and `{second}` overlap in time, and both have topic `{topic}`")]
+    Overlap {
+        /// The topic, or the first of several.
         topic: String,
         /// One file.
         first: PathBuf,
-        /// Type of the topic in the first file.
-        first_type: String,
         /// The other file.
         second: PathBuf,
-        /// Type of the topic in the second file.
-        second_type: String,
     },
     /// The system failed to read the file; the file itself may be intact.
     #[error("cannot read drive `{path}` at byte {offset}")]
@@ -210,6 +210,11 @@ impl ReplayError {
             Self::Outside { .. } => {
                 "name that file itself, if you trust the author of the metadata".to_owned()
             }
+            Self::Overlap { .. } => {
+                "its samples would be mixed: replay drives of several vehicles one \
+                                     by one, or pass --merge if these files are one recording"
+                    .to_owned()
+            }
             Self::Twice { .. } => "its samples would count twice; give each file once".to_owned(),
             Self::Unpack { path, .. } | Self::UnpacksTooLarge { path, .. } => {
                 format!("unpack it yourself: zstd -d {}", word(path))
@@ -241,7 +246,20 @@ impl ReplayError {
                      `sqlite3 {path} .recover | sqlite3 NEW.db3` may find more"
                 )
             }
-            Self::Damaged { .. } => "copy the file again if you can".to_owned(),
+            Self::Damaged {
+                what:
+                    Damage::ChunkCrc { .. } | Damage::DataCrc { .. } | Damage::AttachmentCrc { .. },
+                ..
+            } => "its checksum is wrong: copy the file again if you can".to_owned(),
+            Self::Damaged {
+                path,
+                what: Damage::Truncated(_) | Damage::NoFooter | Damage::Summary(_),
+                ..
+            } => format!(
+                "a recorder that was killed leaves such a file; `mcap recover {}` repairs it",
+                word(path)
+            ),
+            Self::Empty { .. } => "remove it from the command, or from metadata.yaml".to_owned(),
             _ => return None,
         })
     }

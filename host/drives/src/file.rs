@@ -22,6 +22,10 @@ pub(super) struct ChannelInfo {
     pub(super) offered_qos: Option<String>,
     /// The writer of its messages, if the file names it. Clips do.
     pub(super) writer: Option<Guid>,
+    /// True for samples from before a clip. Clips state it.
+    pub(super) is_latched: bool,
+    /// The reason why the layout of its messages is unknown, although definitions were found.
+    pub(super) unknown_layout: Option<&'static str>,
 }
 
 #[cfg(feature = "bags")]
@@ -118,6 +122,8 @@ impl Channels {
                         channel.metadata.get("offered_qos_profiles"),
                     ),
                     writer: channel.metadata.get("gleaner.writer").and_then(Guid::from_hex),
+                    is_latched: channel.metadata.get("gleaner.latched").is_some(),
+                    unknown_layout: None,
                 };
                 self.by_id.insert(channel.id, info);
             }
@@ -265,7 +271,7 @@ pub(super) struct Contents {
 }
 
 impl Contents {
-    /// Returns the first and last log time, in ns.
+    /// Returns the first and last log time, in ns; times beyond the year 2262 are none.
     pub(super) fn span(&self) -> Option<(u64, u64)> {
         if self.times.is_some() {
             return self.times;

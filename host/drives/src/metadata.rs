@@ -89,7 +89,8 @@ pub(super) fn read(text: &str) -> Result<BagMetadata, Box<dyn Error + Send + Syn
     let found = document.rosbag2_bagfile_information;
     let shown =
         |text: &str| text.chars().filter(|c| !c.is_control()).take(SHOWN_CHARS).collect::<String>();
-    if !["mcap", "sqlite3"].contains(&found.storage_identifier.as_str()) {
+    // `ros2 bag reindex` of Humble leaves it empty. The first bytes of a file decide its kind.
+    if !["mcap", "sqlite3", ""].contains(&found.storage_identifier.as_str()) {
         return Err(MetadataError::Storage(shown(&found.storage_identifier)).into());
     }
     let mode = found.compression_mode.unwrap_or_default().to_ascii_lowercase();

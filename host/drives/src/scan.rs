@@ -97,7 +97,7 @@ fn chunk_of_other_times(
         let is_chunk = bytes[0] == op::CHUNK;
         let own = [&bytes[HEAD as usize..][..8], &bytes[HEAD as usize + 8..]]
             .map(|bytes| bytes.try_into().map_or(0, u64::from_le_bytes));
-        if is_chunk && (own != times || times[0] > times[1] || i64::try_from(times[1]).is_err()) {
+        if is_chunk && (own != times || times[0] > times[1]) {
             return Ok(Some(chunk.offset));
         }
     }

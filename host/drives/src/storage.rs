@@ -27,6 +27,8 @@ pub(super) struct Bag {
     pub(super) files: Vec<PathBuf>,
     /// Messages by topic, in all files; empty if unknown.
     pub(super) messages: BTreeMap<String, u64>,
+    /// Set if metadata state that the files are one recording.
+    pub(super) is_one: bool,
     /// A note for the user, in a sentence.
     pub(super) remark: Option<String>,
 }
@@ -72,6 +74,7 @@ pub(super) fn open(
     let mut tracks = Vec::new();
     let mut seen = HashSet::new();
     let mut room = options.limits.unpacked_bytes;
+    let mut recordings = 0;
     for path in paths {
         let bag = bag_of(path)?;
         if let Some(remark) = &bag.remark {
@@ -79,15 +82,23 @@ pub(super) fn open(
         }
         let mut files = Vec::new();
         for file in &bag.files {
+            let is_empty = std::fs::metadata(file).is_ok_and(|found| found.len() == 0);
+            if is_empty && bag.files.len() > 1 {
+                let file = file.display();
+                warn!(%file, "skipped an empty file of a recording, as a killed recorder leaves it");
+                continue;
+            }
             if std::fs::canonicalize(file).is_ok_and(|real| !seen.insert(real)) {
                 return Err(ReplayError::Twice { path: file.clone() });
             }
             files.push(open_file(file, options, opener, &mut room)?);
         }
         count(&mut files, &bag.messages);
-        tracks.extend(
-            files.into_iter().map(|(store, contents)| Track::new(store, contents, &mut writers)),
-        );
+        for (store, contents) in files {
+            recordings += usize::from(!bag.is_one);
+            tracks.push(Track::new(store, contents, &mut writers, recordings));
+        }
+        recordings += 1;
     }
     Ok(tracks)
 }
@@ -134,6 +145,9 @@ impl FileKind {
 }
 
 fn kind_of(source: &mut SourceFile) -> Result<FileKind, ReplayError> {
+    if source.len() == 0 {
+        return Err(ReplayError::Empty { path: source.path().to_owned() });
+    }
     let kind = FileKind::of(source.peek(0, START)?);
     kind.ok_or_else(|| ReplayError::NotMcap { path: source.path().to_owned() })
 }

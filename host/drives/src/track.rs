@@ -1,7 +1,9 @@
 //! One file during a replay: the subscriptions of its channels, and its next segment.
 
+use std::collections::HashSet;
 use std::path::Path;
 
+use super::catalog::DriveChannel;
 use super::chunk::{FileSegment, OpenSegment, Opener, message_head};
 use super::damage::Damage;
 use super::error::ReplayError;
@@ -15,6 +17,9 @@ use super::source::SourceFile;
 use super::writers::{ChannelWriter, Writers};
 use gleaner_messages::Endian;
 use gleaner_transport::{SampleMeta, Subscription};
+
+/// Time in ns by which files of one recording may overlap.
+const OVERLAP_MAX: u64 = 1_000_000_000;
 
 /// Bytes before the CDR of a message.
 const ENCAPSULATION: usize = 4;
@@ -51,6 +56,8 @@ pub(super) struct Track {
     store: Store,
     contents: Contents,
     times: Option<(u64, u64)>,
+    /// Number of the recording that it belongs to.
+    recording: usize,
     /// The part to replay.
     span: Span,
     /// By channel id. Most files have a few channels with small ids, so a table beats a map.
@@ -65,6 +72,9 @@ struct Route {
     /// `None` if the file does not define the channel.
     writer: Option<ChannelWriter>,
     subscriptions: Vec<ChannelSubscription>,
+    /// Number of the layout of its messages among those of its topic.
+    layout: u16,
+    is_latched: bool,
     /// The largest message that a subscription takes, in bytes of CDR.
     max_bytes: usize,
     seen: u64,
@@ -87,18 +97,55 @@ pub(super) struct Routed<'a> {
     /// Set if the message is packed and larger than the subscription takes. Then `cdr` may be only
     /// its beginning.
     pub(super) is_too_big: bool,
+    /// Set if the message is not plain CDR. Then `cdr` is all of it.
+    pub(super) is_malformed: bool,
     pub(super) cdr: &'a [u8],
 }
 
 impl Track {
-    pub(super) fn new(store: Store, contents: Contents, writers: &mut Writers) -> Self {
+    pub(super) fn new(
+        store: Store,
+        contents: Contents,
+        writers: &mut Writers,
+        recording: usize,
+    ) -> Self {
         let mut routes = Vec::new();
         for (id, writer) in writers.of_next_file(store.path(), &contents.channels) {
             // Ids are sorted, and 16 bits wide.
             routes.resize_with(usize::from(id) + 1, Route::default);
-            routes[usize::from(id)].writer = Some(writer);
+            let route = &mut routes[usize::from(id)];
+            route.writer = Some(writer);
+            route.is_latched = contents.channels.get(id).is_some_and(|info| info.is_latched);
         }
-        Self { times: contents.span(), span: Span::ALL, store, contents, routes, queue: Vec::new() }
+        Self {
+            times: contents.span(),
+            recording,
+            span: Span::ALL,
+            store,
+            contents,
+            routes,
+            queue: Vec::new(),
+        }
+    }
+
+    /// Returns the topic that both files have, if they are of two recordings that overlap by more
+    /// than a second. A recorder that goes on in another file may write some messages late.
+    pub(super) fn overlap(&self, other: &Self) -> Option<&str> {
+        let ((from, to), (other_from, other_to)) = self.times.zip(other.times)?;
+        let common = to.min(other_to).saturating_sub(from.max(other_from));
+        if self.recording == other.recording || common <= OVERLAP_MAX {
+            return None;
+        }
+        let others: HashSet<&str> = other.topics().collect();
+        self.topics().find(|topic| others.contains(topic))
+    }
+
+    /// Returns the topics that have messages, or may have some.
+    fn topics(&self) -> impl Iterator<Item = &str> {
+        let Contents { channels, messages, uncounted, .. } = &self.contents;
+        let has_some = |id| *uncounted || messages.get(&id).is_some_and(|count| *count > 0);
+        let all = channels.iter().filter(move |(id, _)| has_some(*id));
+        all.map(|(_, info)| info.topic.as_str())
     }
 
     pub(super) fn path_and_contents(&self) -> (&Path, &Contents) {
@@ -110,9 +157,18 @@ impl Track {
         self.times
     }
 
-    /// Returns whether the last of [`Track::times`] is lost.
+    /// Returns whether the last of [`Track::times`] is lost, or no time of this age.
     pub(super) fn is_end_unknown(&self) -> bool {
-        self.contents.is_end_unknown
+        let is_late = self.times.is_some_and(|(_, last)| i64::try_from(last).is_err());
+        self.contents.is_end_unknown || is_late
+    }
+
+    /// Counts a message of `channel` that was left out, and returns its topic.
+    pub(super) fn leave_out(&mut self, channel: u16) -> String {
+        if let Some(route) = self.routes.get_mut(usize::from(channel)) {
+            route.seen += 1;
+        }
+        topic_of(&self.contents, channel)
     }
 
     pub(super) fn damaged(&self, offset: u64, what: Damage) -> ReplayError {
@@ -120,8 +176,15 @@ impl Track {
     }
 
     /// Subscribes a channel. `max_bytes` is the largest message to deliver, in bytes of CDR.
-    pub(super) fn subscribe(&mut self, channel: u16, subscription: Subscription, max_bytes: usize) {
-        if let Some(channel) = self.routes.get_mut(usize::from(channel)) {
+    pub(super) fn subscribe(
+        &mut self,
+        channel: DriveChannel,
+        subscription: Subscription,
+        max_bytes: usize,
+    ) {
+        let layout = channel.layout;
+        if let Some(channel) = self.routes.get_mut(usize::from(channel.id)) {
+            channel.layout = layout;
             channel.subscriptions.push(ChannelSubscription { by: subscription, max_bytes });
             channel.max_bytes = channel.max_bytes.max(max_bytes);
         }
@@ -232,20 +295,19 @@ impl Track {
             }
             message = inflate.bytes();
         }
+        let mut is_malformed = false;
         let (endian, options, cdr) = match message {
             &[0, 0, a, b, ref cdr @ ..] => (Endian::Big, [a, b], cdr),
             &[0, 1, a, b, ref cdr @ ..] => (Endian::Little, [a, b], cdr),
             other => {
-                let topic = topic_of(&self.contents, head.channel);
-                return Err(Damage::Encapsulation {
-                    topic,
-                    found: other[..other.len().min(4)].to_vec(),
-                });
+                is_malformed = true;
+                (Endian::Little, [0; 2], other)
             }
         };
         if delivered == 0 {
             writer.count(head.sequence);
-            channel.seen += 1;
+            // `leave_out` counts the others.
+            channel.seen += u64::from(!is_malformed);
         }
         Ok(Routed {
             subscription: wanted.by,
@@ -257,7 +319,10 @@ impl Track {
                 seq: writer.last_seq(),
                 endian,
                 options,
+                layout: channel.layout,
+                is_latched: channel.is_latched,
             },
+            is_malformed,
             is_too_big: is_packed && cdr.len() > wanted.max_bytes,
             cdr,
         })

@@ -83,7 +83,9 @@ impl Writers {
         let claims: Vec<_> = channels
             .iter()
             .map(|(id, info)| {
-                let claim = info.writer.filter(|guid| taken.insert((info.topic.as_str(), *guid)));
+                // Samples from before a clip are in a channel of their own.
+                let key = |guid: &Guid| (info.topic.as_str(), *guid, info.is_latched);
+                let claim = info.writer.filter(|guid| taken.insert(key(guid)));
                 ignored += u32::from(info.writer.is_some() && claim.is_none());
                 (id, info.topic.as_str(), claim)
             })
@@ -101,7 +103,7 @@ impl Writers {
             let is_named = claim.is_some_and(|guid| !guid.0.starts_with(MADE_UP));
             let guid = claim.unwrap_or_else(|| {
                 let mut attempts = (0..=u32::MAX).map(|attempt| made_up(file, id, attempt));
-                let free = attempts.find(|guid| taken.insert((topic, *guid)));
+                let free = attempts.find(|guid| taken.insert((topic, *guid, false)));
                 free.expect("a file has fewer channels than there are attempts")
             });
             let numbers = match self.counters.entry((topic.to_owned(), guid)) {

@@ -55,6 +55,7 @@ fn info(id: u32, first_word: u32) -> AttachedTopic {
         digests: 0,
         refused: 0,
         definitions: None,
+        type_hash: None,
         is_recorded: false,
         offered_qos: None,
     }

@@ -14,6 +14,14 @@ pub enum ImageError {
     /// stopped.
     #[error(transparent)]
     Pixels(#[from] PixelError),
+    /// A `CompressedImage` with a format that is not decoded, or does not match its bytes.
+    #[error("format `{format}`: {why}")]
+    MessageFormat {
+        /// The format, or the start of a long one.
+        format: String,
+        /// The reason and the way out.
+        why: String,
+    },
     /// Bytes that are not an image file.
     #[error("data is neither JPEG nor PNG: its {len} bytes start with {start:02x?}")]
     NotAnImage {
@@ -68,8 +76,8 @@ pub enum ImageError {
         /// Number of bytes.
         len: usize,
     },
-    /// A kind of file that cameras do not send.
-    #[error("{format} is {what}, which is not supported")]
+    /// A kind of file that is not decoded.
+    #[error("{format} is {what}, which is not supported: publish baseline JPEG, or PNG of 8 bits")]
     Unsupported {
         /// Format of the file.
         format: Format,
@@ -86,25 +94,30 @@ pub enum ImageError {
         /// The violation.
         what: &'static str,
     },
-    /// The JPEG decoder failed.
-    #[error("cannot decode the JPEG of {width}x{height}")]
+    /// A resize whose result would have 8 of the 16 bits.
+    #[error(
+        "resize of mono16 would keep 8 of its 16 bits: call `to_gray` first, or read its pixels"
+    )]
+    ResizeOfMono16,
+    /// The JPEG decoder failed. Its cause is in the text: a lambda's author sees one line.
+    #[error("cannot decode the JPEG of {width}x{height}: {cause}")]
     Jpeg {
         /// Pixels per row.
         width: u32,
         /// Rows.
         height: u32,
         /// The cause.
-        source: zune_jpeg::errors::DecodeErrors,
+        cause: zune_jpeg::errors::DecodeErrors,
     },
     /// The PNG decoder failed.
-    #[error("cannot decode the PNG of {width}x{height}")]
+    #[error("cannot decode the PNG of {width}x{height}: {cause}")]
     Png {
         /// Pixels per row.
         width: u32,
         /// Rows.
         height: u32,
         /// The cause.
-        source: png::DecodingError,
+        cause: png::DecodingError,
     },
 }
 
@@ -113,13 +126,15 @@ impl ImageError {
     pub fn kind(&self) -> PixelErrorKind {
         match self {
             Self::Pixels(error) => error.kind(),
-            Self::NotAnImage { .. }
+            Self::MessageFormat { .. }
+            | Self::NotAnImage { .. }
             | Self::Bomb { .. }
             | Self::WorkingMemory { .. }
             | Self::OtherImage { .. }
             | Self::Truncated { .. }
             | Self::Unsupported { .. }
             | Self::Damaged { .. }
+            | Self::ResizeOfMono16
             | Self::Jpeg { .. }
             | Self::Png { .. } => PixelErrorKind::Unreadable,
         }

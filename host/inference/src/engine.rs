@@ -280,6 +280,7 @@ impl InferenceEngine {
                     inputs: ready.inputs.clone(),
                     outputs: ready.outputs.clone(),
                     runtime: ready.runtime.clone(),
+                    metadata: ready.metadata.clone(),
                 };
                 lambda.opened.insert(call.model);
                 lambda.reply(call.id, Ok(opened), None, 0);

@@ -124,7 +124,7 @@ impl ModelLoader {
                 Vec::new()
             }
         };
-        let ModelSignature { inputs, outputs, .. } = signature;
+        let ModelSignature { inputs, outputs, metadata, .. } = signature;
         let ranks = shapes.into_iter().map(Some).chain(std::iter::repeat(None));
         let outputs = outputs.into_iter().zip(ranks).map(|(output, rank)| {
             let (mut tensor, has_shape) = (output.tensor, output.has_shape);
@@ -135,7 +135,7 @@ impl ModelLoader {
         });
         let outputs = outputs.collect();
         let load_ns = u64::try_from(start.elapsed().as_nanos()).unwrap_or(u64::MAX);
-        Ok((graph, ReadyModel { inputs, outputs, runtime, reason, built_for, load_ns }))
+        Ok((graph, ReadyModel { inputs, outputs, metadata, runtime, reason, built_for, load_ns }))
     }
 
     /// Returns what to do about an engine, if TensorRT is to load the model.

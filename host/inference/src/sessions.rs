@@ -50,6 +50,7 @@ pub(crate) enum LoadState {
 pub(crate) struct ReadyModel {
     pub(crate) inputs: Vec<TensorInfo>,
     pub(crate) outputs: Vec<TensorInfo>,
+    pub(crate) metadata: Vec<(String, String)>,
     pub(crate) runtime: String,
     pub(crate) reason: String,
     /// Name of the runtime of the engine that was built.

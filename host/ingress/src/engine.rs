@@ -322,6 +322,7 @@ impl Ingress {
             digests: attached.digests,
             refused: attached.refused,
             definitions: definitions.map(str::to_owned),
+            type_hash: found.and_then(|found| found.type_hash.clone()),
             is_recorded: self.source.knows_all_topics(),
             offered_qos: found.and_then(|found| found.offered_qos.clone()),
         };

@@ -422,6 +422,8 @@ mod tests {
             seq,
             endian: Endian::Little,
             options: [0; 2],
+            layout: 0,
+            is_latched: false,
         }
     }
 

@@ -167,6 +167,8 @@ fn publish(source: &Loopback, stop: &AtomicBool) -> Vec<u64> {
             seq,
             endian: Endian::Little,
             options: [0; 2],
+            layout: 0,
+            is_latched: false,
         };
         let begun = Instant::now();
         source.publish("/words", &meta, &cdr).unwrap();

@@ -55,6 +55,9 @@ pub enum CdrError {
     /// [`super::FieldPath::number`] was called on a path whose kind is not a number.
     #[error("the field is not a number")]
     NotANumber,
+    /// The message has a layout that its topic did not have when the path was compiled.
+    #[error("it has layout {0} of its type, which is unknown")]
+    Layout(u16),
 }
 
 /// A position in a CDR payload.

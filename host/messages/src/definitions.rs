@@ -17,6 +17,8 @@ pub struct Definitions {
     type_name: String,
     /// Every reachable type; the root is the last.
     structs: Vec<Struct>,
+    /// Further layouts of the type, which have none themselves.
+    others: Vec<Self>,
 }
 
 #[derive(Debug)]
@@ -118,7 +120,7 @@ impl Definitions {
         let mut resolver =
             Resolver { parts, structs: Vec::new(), known: HashMap::new(), open: Vec::new() };
         resolver.resolve(&root)?;
-        Ok(Self { type_name: full_name(&root), structs: resolver.structs })
+        Ok(Self { type_name: full_name(&root), structs: resolver.structs, others: Vec::new() })
     }
 
     /// Returns the type's full name, `pkg/msg/Type`.
@@ -131,8 +133,22 @@ impl Definitions {
         self.root().fields.iter().map(|field| field.name.as_str())
     }
 
+    /// Adds further layouts of the type, which samples may have instead of this one: they are
+    /// numbered from 1, and this one is 0.
+    pub fn with_layouts(mut self, others: Vec<Self>) -> Self {
+        self.others = others;
+        self
+    }
+
+    /// Returns the layouts of the type by their numbers, itself first.
+    pub fn layouts(&self) -> impl Iterator<Item = &Self> {
+        std::iter::once(self).chain(&self.others)
+    }
+
     /// Returns whether both define the same fields.
-    pub(super) fn is_equivalent(&self, other: &Self) -> bool {
+    ///
+    /// Comments, constants and default values are no part of them.
+    pub fn is_equivalent(&self, other: &Self) -> bool {
         let all = |definitions: &Self| -> Vec<(String, Vec<FieldDefinition<usize>>)> {
             definitions.structs.iter().map(|one| (one.name.clone(), one.fields.clone())).collect()
         };
@@ -311,6 +327,9 @@ mod tests {
         let definitions = Definitions::parse("pkg/msg/Outer", text).unwrap();
         assert_eq!(definitions.type_name(), "pkg/msg/Outer");
         assert_eq!(definitions.fields().collect::<Vec<_>>(), ["a", "b"]);
+        // Some editors put a byte order mark in front.
+        let marked = Definitions::parse("pkg/msg/Outer", &format!("\u{feff}{text}")).unwrap();
+        assert!(definitions.is_equivalent(&marked));
     }
 
     #[test]

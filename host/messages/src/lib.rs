@@ -30,4 +30,4 @@ pub use path::{FieldPath, PathError};
 pub use sources::{Sources, SourcesError};
 pub use stamp::{HeaderStamp, header_stamp};
 pub use value::{MessageValue, ValueKind};
-pub use views::{CompressedView, ImageView};
+pub use views::{CompressedView, ImageView, is_viewed};

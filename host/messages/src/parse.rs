@@ -73,6 +73,7 @@ const MAX_FIXED: usize = 1 << 28;
 
 /// Splits a definition text into its parts and parses the fields of each.
 pub(super) fn parts(text: &str) -> Result<Vec<DefinitionPart<'_>>, MessageError> {
+    let text = text.trim_start_matches('\u{feff}');
     let mut parts = vec![DefinitionPart { name: None, fields: Vec::new() }];
     // A separator begins a part; the following line `MSG: pkg/Type` names it.
     let mut awaits_name = false;

@@ -17,6 +17,8 @@ pub struct FieldPath {
     type_name: String,
     ops: Box<[Op]>,
     leaf: Leaf,
+    /// The path in further layouts of the type, from number 1 on.
+    others: Box<[Self]>,
 }
 
 /// Reasons why a path does not lead to a readable field.
@@ -88,15 +90,54 @@ pub enum PathError {
         /// The wstring.
         field: String,
     },
+    /// The topic has several layouts of its type, in which the path means different things.
+    #[error(
+        "`{path}` does not mean the same in all layouts of `{type_name}` on this topic: in that \
+         with the fields {}, {}; in that with the fields {}, {}",
+        first.0, first.1, second.0, second.1
+    )]
+    Layouts {
+        /// The path.
+        path: String,
+        /// The type.
+        type_name: String,
+        /// Fields of one layout, and the meaning of the path in it.
+        first: Box<(String, String)>,
+        /// The same for another layout.
+        second: Box<(String, String)>,
+    },
 }
 
 impl FieldPath {
-    /// Compiles `path`, such as `linear_acceleration.x`, `cov[3]` or `fields[2].name`.
+    /// Compiles `path`, such as `linear_acceleration.x`, `cov[3]` or `fields[2].name`, in all
+    /// layouts of the type.
     ///
     /// # Errors
     ///
-    /// [`PathError`], naming the type and its fields.
+    /// [`PathError`], naming the type and its fields. [`PathError::Layouts`] if the path leads to a
+    /// value in one layout, and to none or one of another kind in another.
     pub fn compile(definitions: &Definitions, path: &str) -> Result<Self, PathError> {
+        let found = Self::compile_in(definitions, path);
+        let mut others = Vec::new();
+        for other in definitions.layouts().skip(1) {
+            let again = Self::compile_in(other, path);
+            match (&found, again) {
+                (Ok(found), Ok(again)) if found.kind().is_like(again.kind()) => others.push(again),
+                (Err(_), Err(_)) => {}
+                (found, again) => {
+                    return Err(PathError::Layouts {
+                        path: path.to_owned(),
+                        type_name: definitions.type_name().to_owned(),
+                        first: Box::new(meaning(definitions, found)),
+                        second: Box::new(meaning(other, &again)),
+                    });
+                }
+            }
+        }
+        found.map(|found| Self { others: others.into(), ..found })
+    }
+
+    fn compile_in(definitions: &Definitions, path: &str) -> Result<Self, PathError> {
         let segments = segments(path)?;
         let mut compiler = Compiler { definitions, path, ops: Vec::new() };
         let leaf = compiler.enter_struct(definitions.root(), &segments)?;
@@ -105,13 +146,28 @@ impl FieldPath {
             type_name: definitions.type_name().to_owned(),
             ops: compiler.ops.into(),
             leaf,
+            others: Box::default(),
         })
+    }
+
+    /// Returns the path in the layout with this number.
+    ///
+    /// # Errors
+    ///
+    /// [`CdrError::Layout`] if the type had no such layout when the path was compiled.
+    #[inline]
+    pub fn in_layout(&self, number: u16) -> Result<&Self, CdrError> {
+        match number {
+            0 => Ok(self),
+            _ => self.others.get(usize::from(number) - 1).ok_or(CdrError::Layout(number)),
+        }
     }
 
     /// Returns whether reading it may walk over much of a message, because elements of variable
     /// size precede the field.
     pub fn walks(&self) -> bool {
         self.ops.iter().any(|op| matches!(op, Op::Each { .. } | Op::Times { .. }))
+            || self.others.iter().any(Self::walks)
     }
 
     /// Returns the path as written.
@@ -151,6 +207,16 @@ impl FieldPath {
         walk(&self.ops, &mut cursor)?;
         self.leaf.number(&mut cursor)
     }
+}
+
+/// Describes a layout and the meaning of a path in it.
+fn meaning(definitions: &Definitions, found: &Result<FieldPath, PathError>) -> (String, String) {
+    let fields: Vec<_> = definitions.fields().map(|field| format!("`{field}`")).collect();
+    let meaning = match found {
+        Ok(path) => format!("it is {}", path.kind()),
+        Err(error) => error.to_string(),
+    };
+    (fields.join(", "), meaning)
 }
 
 struct Compiler<'d> {

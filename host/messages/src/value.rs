@@ -1,5 +1,7 @@
 //! Values that field paths read.
 
+use std::fmt;
+
 /// The kind of value that a field path leads to, known before any message is read.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Hash)]
 pub enum ValueKind {
@@ -22,9 +24,28 @@ pub enum ValueKind {
 }
 
 impl ValueKind {
+    /// Returns whether a caller may treat both kinds alike.
+    pub(super) fn is_like(self, other: Self) -> bool {
+        self == other || (self.is_number() && other.is_number())
+    }
+
     /// Returns whether [`super::FieldPath::number`] can read it.
     pub fn is_number(self) -> bool {
         matches!(self, Self::Bool | Self::Signed | Self::Unsigned | Self::Real)
+    }
+}
+
+impl fmt::Display for ValueKind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Bool => "a boolean",
+            Self::Signed | Self::Unsigned => "an integer",
+            Self::Real => "a floating-point number",
+            Self::Text => "a string",
+            Self::Bytes => "an array of bytes",
+            Self::Numbers => "an array of numbers",
+            Self::Texts => "an array of strings",
+        })
     }
 }
 

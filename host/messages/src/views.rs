@@ -1,6 +1,8 @@
 //! Views of the two image messages, borrowed from the bytes.
 
 use super::cdr::{CdrError, Cursor, Endian};
+use super::definitions::Definitions;
+use super::sources::Sources;
 
 /// A `sensor_msgs/msg/Image` without its header.
 ///
@@ -29,6 +31,14 @@ pub struct CompressedView<'a> {
     pub format: &'a str,
     /// The compressed file.
     pub data: &'a [u8],
+}
+
+/// Returns whether a view reads messages of these definitions: all of their layouts are that of
+/// ROS 2, whatever the type is called.
+pub fn is_viewed(definitions: &Definitions) -> bool {
+    let known = Sources::new(&[], &[]).find(definitions.type_name()).ok().flatten();
+    let known = known.and_then(|text| Definitions::parse(definitions.type_name(), &text).ok());
+    known.is_some_and(|known| definitions.layouts().all(|layout| layout.is_equivalent(&known)))
 }
 
 impl<'a> ImageView<'a> {

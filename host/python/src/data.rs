@@ -183,10 +183,8 @@ impl Sample {
         offset: u64,
         len: Option<u32>,
     ) -> PyResult<Bound<'py, PyBytes>> {
-        let bytes = self
-            .inner
-            .cdr(offset, len.unwrap_or(u32::MAX))
-            .map_err(|error| refused(py, error.into()))?;
+        let bytes =
+            self.inner.cdr(offset, len.unwrap_or(u32::MAX)).map_err(|error| refused(py, error))?;
         Ok(PyBytes::new(py, &bytes))
     }
 

@@ -82,10 +82,8 @@ impl Frame {
         offset: u64,
         len: Option<u32>,
     ) -> PyResult<Bound<'py, PyBytes>> {
-        let bytes = self
-            .0
-            .read(offset, len.unwrap_or(u32::MAX))
-            .map_err(|error| refused(py, error.into()))?;
+        let bytes =
+            self.0.read(offset, len.unwrap_or(u32::MAX)).map_err(|error| refused(py, error))?;
         Ok(PyBytes::new(py, &bytes))
     }
 

@@ -1,6 +1,6 @@
 //! Creates a small JPEG from an image message, for lists of clips.
 
-use gleaner_image::{self as image, Encoding, View, ops};
+use gleaner_image::{self as image, Encoding, ImageHeader, StopCheck, View, ops};
 use gleaner_messages::{CompressedView, Endian, ImageView};
 use jpeg_encoder::{ColorType, Encoder};
 
@@ -58,7 +58,7 @@ pub fn thumbnail_with_boxes(
             raw(&ImageView::read(cdr, endian).ok()?, boxes)
         }
         "sensor_msgs/msg/CompressedImage" | "sensor_msgs/CompressedImage" => {
-            compressed(CompressedView::read(cdr, endian).ok()?.data, boxes)
+            compressed(&CompressedView::read(cdr, endian).ok()?, boxes)
         }
         _ => None,
     }
@@ -77,13 +77,17 @@ fn raw(message: &ImageView<'_>, boxes: &[ObjectBox]) -> Option<Vec<u8>> {
     small(&view.ok()?, boxes)
 }
 
-fn compressed(data: &[u8], boxes: &[ObjectBox]) -> Option<Vec<u8>> {
-    let header = image::probe(data).ok()?;
-    let len = header.rgb8_len().filter(|len| *len <= DECODED_BYTES)?;
-    let mut pixels = vec![0; len];
-    image::decode_rgb8(data, &header, DECODED_BYTES, &mut pixels).ok()?;
-    let step = header.width.checked_mul(3)?;
-    let view = View::new(header.width, header.height, step, Encoding::Rgb8, false, &pixels);
+fn compressed(message: &CompressedView<'_>, boxes: &[ObjectBox]) -> Option<Vec<u8>> {
+    // People look at it, so that a format which contradicts the bytes does no harm.
+    let (header, file) = image::probe_message(message.format, message.data)
+        .or_else(|_| image::probe(message.data).map(|header| (header, message.data)))
+        .ok()?;
+    header.rgb8_len().filter(|len| *len <= DECODED_BYTES)?;
+    let mut pixels = vec![0; header.decoded_len()?];
+    image::decode(file, &header, DECODED_BYTES, &mut pixels, &StopCheck::new(&|| true)).ok()?;
+    let ImageHeader { width, height, encoding, .. } = header;
+    let step = width.checked_mul(encoding.bytes_per_pixel() as u32)?;
+    let view = View::new(width, height, step, encoding, false, &pixels);
     small(&view.ok()?, boxes)
 }
 

@@ -10,6 +10,7 @@ use gleaner_rules::clamps;
 
 use super::error::DataError;
 use super::fuel::{Fuel, OutOfFuel};
+use super::shared_bytes::SharedBytes;
 
 /// Limits of one call, shared by all inputs of a lambda.
 #[derive(Clone)]
@@ -40,6 +41,24 @@ impl PerCall {
     /// work.
     pub(super) fn charge(&self, bytes: impl FnOnce() -> usize) -> Result<(), OutOfFuel> {
         self.fuel.charge(bytes)
+    }
+
+    /// Returns `len` bytes of `whole` from `offset`, or fewer where it ends, never because of the
+    /// limit, and charges them. `whole` is a `kind` of `topic`.
+    pub(super) fn piece(
+        &self,
+        whole: &SharedBytes,
+        (offset, len): (u64, u32),
+        kind: &'static str,
+        topic: &str,
+    ) -> Result<SharedBytes, DataError> {
+        let piece = whole.part(offset, len as usize);
+        let (bytes, most) = (piece.len(), self.bytes);
+        self.charge(|| bytes.min(most))?;
+        if bytes > most {
+            return Err(DataError::TooLong { kind, topic: topic.to_owned(), bytes, most });
+        }
+        Ok(piece)
     }
 
     /// Limits of its result.

@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use gleaner_buffers::shared::SharedReader;
 use gleaner_buffers::{Lease, RingCounts, RingReader};
-use gleaner_messages::{CdrError, Definitions, FieldPath, HeaderStamp, header_stamp};
+use gleaner_messages::{CdrError, Definitions, FieldPath, HeaderStamp, header_stamp, is_viewed};
 use gleaner_rules::clamps::{self, WrongField};
 pub use gleaner_rules::clamps::{PATH_BYTES, SAMPLES_PER_CALL, TEXTS_PER_FIELD};
 use gleaner_transport::StoredMeta;
@@ -43,7 +43,10 @@ pub struct Topic {
     depth: usize,
     /// `None` if there are none: the lambda can then read bytes, but no fields.
     definitions: Option<Arc<Definitions>>,
-    pub(super) header: Option<HeaderStamp>,
+    /// By the number of the layout.
+    pub(super) headers: Box<[Option<HeaderStamp>]>,
+    /// True if its messages have not the layout of the pictures of ROS 2.
+    pub(super) has_other_layout: bool,
     pub(super) images: Images,
     pub(super) per_call: PerCall,
     skipped: AtomicU64,
@@ -89,7 +92,11 @@ impl Topic {
             input: input.to_owned(),
             topic: topic.to_owned(),
             type_name: type_name.to_owned(),
-            header: definitions.as_deref().and_then(header_stamp),
+            headers: definitions
+                .iter()
+                .flat_map(|known| known.layouts().map(header_stamp))
+                .collect(),
+            has_other_layout: definitions.as_deref().is_some_and(|known| !is_viewed(known)),
             reader,
             depth,
             newest: Mutex::default(),
@@ -306,7 +313,9 @@ impl Topic {
         message: &[u8],
         meta: &StoredMeta,
     ) -> Result<f64, DataError> {
-        path.number(message, meta.sample.endian).map_err(|error| self.unreadable(path, error))
+        path.in_layout(meta.sample.layout)
+            .and_then(|path| path.number(message, meta.sample.endian))
+            .map_err(|error| self.unreadable(path, error))
     }
 
     pub(super) fn unreadable(&self, path: &FieldPath, error: CdrError) -> DataError {

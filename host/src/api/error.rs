@@ -33,6 +33,11 @@ pub enum DataError {
     #[error("{0}")]
     OutOfRange(ImageError),
     #[error(
+        "{bytes} bytes of a {kind} of `{topic}` are requested; one call returns at most {most}: \
+         read it in pieces, by `offset` and `len`"
+    )]
+    TooLong { kind: &'static str, topic: String, bytes: usize, most: usize },
+    #[error(
         "the lambda keeps too many samples of input `{input}`: raise `hold` of this [[input]], or \
          keep fewer"
     )]
@@ -81,7 +86,7 @@ impl DataError {
             Self::Malformed { .. } => DataErrorKind::Malformed,
             Self::NoImageType { .. } | Self::NotAFrame { .. } => DataErrorKind::NotAFrame,
             Self::TooLarge { .. } | Self::NoSlot { .. } | Self::NoRoom(_) => DataErrorKind::NoRoom,
-            Self::OutOfRange(_) => DataErrorKind::OutOfRange,
+            Self::OutOfRange(_) | Self::TooLong { .. } => DataErrorKind::OutOfRange,
             // A guest that can be interrupted is ended instead.
             Self::OutOfHolds { .. } | Self::OutOfTime | Self::OutOfFuel(_) => DataErrorKind::NoRoom,
         }

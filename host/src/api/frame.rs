@@ -1,5 +1,5 @@
 //! Frames: samples as images. Raw pixels are used in place; JPEG and PNG are decoded on demand into
-//! separate slots.
+//! separate slots. Grey of 16 bits keeps them; only `to_gray` makes 8 of them.
 
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, PoisonError};
@@ -8,7 +8,7 @@ use std::time::Instant;
 use gleaner_buffers::{DraftError, Lease, Pool};
 use gleaner_messages::{CdrError, CompressedView, Endian, ImageView};
 
-use super::data::{DataError, Identity, OutOfFuel, Sample, Stamps};
+use super::data::{DataError, Identity, Sample, Stamps};
 pub use super::images::Images;
 use super::shared_bytes::SharedBytes;
 use gleaner_image::{
@@ -67,6 +67,11 @@ pub(super) enum ImageMessage<'a> {
 }
 
 impl<'a> ImageMessage<'a> {
+    /// Returns whether this is the name of a type of images.
+    pub(super) fn is_type(type_name: &str) -> bool {
+        [IMAGE, COMPRESSED_IMAGE].contains(&type_name)
+    }
+
     /// Parses a message; `None` if its type is no image.
     pub(super) fn of(
         type_name: &str,
@@ -109,7 +114,7 @@ impl Frame {
         match picture {
             ImageMessage::Raw(raw) => Self::raw(source, sample, &raw, taken),
             ImageMessage::Compressed(compressed) => {
-                Self::decoded(source, sample, compressed.data, taken)
+                Self::decoded(source, sample, &compressed, taken)
             }
         }
     }
@@ -139,7 +144,7 @@ impl Frame {
     fn decoded(
         source: FrameOrigin,
         sample: &Sample,
-        data: &[u8],
+        compressed: &CompressedView<'_>,
         taken: FrameLease,
     ) -> Result<Self, DataError> {
         let owner = Arc::clone(&source.topic);
@@ -157,12 +162,12 @@ impl Frame {
         // The older image's slot may be the one that is needed now.
         *newest = None;
         let started = Instant::now();
-        let bytes = image::probe(data)
+        let bytes = image::probe_message(compressed.format, compressed.data)
             .ok()
-            .and_then(|header| header.rgb8_len())
+            .and_then(|(header, _)| header.rgb8_len())
             .map_or(0, |len| len.min(pool.slot_bytes()));
         owner.per_call.due.allows(bytes, FASTEST_DECODE)?;
-        let lease = decode(&source, pool, data)?;
+        let lease = decode(&source, pool, compressed)?;
         images.decode_ns.fetch_add(started.elapsed().as_nanos() as u64, Ordering::Relaxed);
         *newest = position.map(|position| (position, lease.clone()));
         Ok(Self::of_decoded(source, lease, taken))
@@ -214,16 +219,14 @@ impl Frame {
         &self.pixels
     }
 
-    /// Bytes from `offset`, `len` at most, clamped to the frame and to `call_bytes` of `[limits]`.
+    /// Bytes from `offset`: `len`, or fewer where the frame ends.
     ///
     /// # Errors
     ///
-    /// [`OutOfFuel`].
-    pub fn read(&self, offset: u64, len: u32) -> Result<SharedBytes, OutOfFuel> {
-        let per_call = &self.source.topic.per_call;
-        let piece = self.pixels.part(offset, per_call.bytes.min(len as usize));
-        per_call.charge(|| piece.len())?;
-        Ok(piece)
+    /// [`DataError::TooLong`] for more than `call_bytes` of `[limits]`; [`DataError::OutOfFuel`].
+    pub fn read(&self, offset: u64, len: u32) -> Result<SharedBytes, DataError> {
+        let FrameOrigin { topic, identity, .. } = &self.source;
+        topic.per_call.piece(&self.pixels, (offset, len), "frame", &identity.topic)
     }
 
     /// Mean BT.601 luma, 0 to 255, computed in integers.
@@ -254,21 +257,24 @@ impl Frame {
         Ok(Paid(self))
     }
 
-    /// Returns a new frame of that size: rgb8, or mono8 for grey encodings.
+    /// Returns a new frame of that size: rgb8, or mono8 for one of mono8.
     ///
     /// # Errors
     ///
     /// [`DataError::OutOfRange`] for sides of 0 or above [`ops::MAX_RESIZED_SIDE`];
-    /// [`DataError::NoRoom`]; as [`Frame::mean_luma`].
+    /// [`DataError::NoRoom`]; [`DataError::NotAFrame`] for mono16; as [`Frame::mean_luma`].
     pub fn resize(&self, width: u32, height: u32) -> Result<Self, DataError> {
         let paid = self.begin(PixelOperation::Resize(width, height))?;
+        if self.info.encoding == Encoding::Mono16 {
+            return Err(self.source.not_a_frame(ImageError::ResizeOfMono16));
+        }
         let (encoding, _) = ops::resized(&self.view()?, width, height)
             .map_err(|error| self.source.refused(error))?;
         let info = Info::tight(width, height, encoding);
         paid.make(info, |view, out| ops::resize(view, width, height, out).map(drop))
     }
 
-    /// Returns a new mono8 frame of the same size.
+    /// Returns a new mono8 frame of the same size; of 16 bits, their high byte.
     ///
     /// # Errors
     ///
@@ -352,9 +358,14 @@ impl FrameOrigin {
     }
 }
 
-fn decode(source: &FrameOrigin, pool: &Pool<Info>, data: &[u8]) -> Result<Lease<Info>, DataError> {
+fn decode(
+    source: &FrameOrigin,
+    pool: &Pool<Info>,
+    compressed: &CompressedView<'_>,
+) -> Result<Lease<Info>, DataError> {
     let topic = || source.identity.topic.clone();
-    let header = image::probe(data).map_err(|error| source.not_a_frame(error))?;
+    let (header, file) = image::probe_message(compressed.format, compressed.data)
+        .map_err(|error| source.not_a_frame(error))?;
     let allowed = pool.slot_bytes();
     let too_large = || {
         let (width, height) = (header.width, header.height);
@@ -364,7 +375,9 @@ fn decode(source: &FrameOrigin, pool: &Pool<Info>, data: &[u8]) -> Result<Lease<
             source: ImageError::Bomb { width, height, needed, allowed },
         }
     };
-    let len = header.rgb8_len().ok_or_else(too_large)?;
+    // `decoded_size` counts rgb8, whatever the image becomes.
+    header.rgb8_len().filter(|len| *len <= allowed).ok_or_else(too_large)?;
+    let len = header.decoded_len().ok_or_else(too_large)?;
     let mut draft = pool.draft(len).map_err(|refusal| match refusal {
         DraftError::NoSlot => {
             DataError::NoSlot { topic: topic(), input: source.topic.name().to_owned() }
@@ -372,7 +385,7 @@ fn decode(source: &FrameOrigin, pool: &Pool<Info>, data: &[u8]) -> Result<Lease<
         DraftError::TooBig { .. } => too_large(),
     })?;
     let in_time = || source.topic.per_call.due.check().is_ok();
-    image::decode_rgb8_paced(data, &header, allowed, &mut draft, &StopCheck::new(&in_time))
+    image::decode(file, &header, allowed, &mut draft, &StopCheck::new(&in_time))
         .map_err(|error| source.refused(error))?;
-    Ok(draft.seal(Info::tight(header.width, header.height, Encoding::Rgb8)))
+    Ok(draft.seal(Info::tight(header.width, header.height, header.encoding)))
 }

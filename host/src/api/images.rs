@@ -5,6 +5,7 @@ use std::sync::{Mutex, PoisonError};
 
 use gleaner_buffers::{Lease, Pool};
 use gleaner_image as image;
+use gleaner_messages::CompressedView;
 use gleaner_rules::frames::Budget;
 
 use super::frame::Info;
@@ -29,17 +30,21 @@ impl Images {
         Self { decoded, budget, newest: Mutex::new(None), decode_ns: AtomicU64::new(0) }
     }
 
-    /// Work of decoding `data` in bytes, estimated by its header; 0 if it is the newest decoded
-    /// image.
-    pub(super) fn decode_work(&self, position: Option<u64>, data: &[u8]) -> usize {
+    /// Work of decoding `compressed` in bytes, estimated by its header; 0 if it is the newest
+    /// decoded image.
+    pub(super) fn decode_work(
+        &self,
+        position: Option<u64>,
+        compressed: &CompressedView<'_>,
+    ) -> usize {
         let newest = self.newest.lock().unwrap_or_else(PoisonError::into_inner);
         if newest.as_ref().is_some_and(|(at, _)| Some(*at) == position) {
             return 0;
         }
         let room = self.decoded.as_ref().map_or(0, Pool::slot_bytes);
-        image::probe(data)
+        image::probe_message(compressed.format, compressed.data)
             .ok()
-            .and_then(|header| header.rgb8_len())
+            .and_then(|(header, _)| header.rgb8_len())
             .map_or(0, |len| len.min(room).saturating_mul(DECODE))
     }
 

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use gleaner_base::visible;
-use gleaner_protocol::inference::{ModelFaultKind, TensorInfo, TensorPlace};
+use gleaner_protocol::inference::{Element, ModelFaultKind, TensorInfo, TensorPlace};
 use gleaner_rules::refused;
 use gleaner_vision::{Detection, DetectorLayout, Preprocess, VisionError, Wanted};
 
@@ -288,15 +288,32 @@ fn check_layout(
     };
     let how = layout.preprocess(&input.shape).map_err(|error| wrong(error.to_string()))?;
     let outputs: Vec<_> = opened.outputs.iter().map(|it| it.shape.as_slice()).collect();
-    let classes = layout.check(&outputs, (how.width, how.height));
+    let classes = layout.check(&outputs, (how.width, how.height), &opened.note);
     let (labels, classes) =
         (entry.labels.len(), classes.map_err(|error| wrong(error.to_string()))?);
-    match classes {
-        Some(classes) if labels > 0 && labels as u64 != u64::from(classes) => {
-            Err(wrong(format!("it has {classes} classes, and its `labels` have {labels} lines")))
-        }
-        _ => Ok(how),
+    if let Some(classes) = classes.filter(|it| labels > 0 && labels as u64 != u64::from(*it)) {
+        let why = format!("it has {classes} classes, and its `labels` have {labels} lines");
+        return Err(wrong(why));
     }
+    if let Some((index, label, class)) = opened.note.contradicted(&entry.labels) {
+        return Err(wrong(format!(
+            "its `labels` have `{}` for class {index}, and its metadata has it for class {class}: \
+             use the labels with which it was trained",
+            visible(label)
+        )));
+    }
+    for (what, info) in
+        [("input", input)].into_iter().chain(opened.outputs.first().map(|it| ("output", it)))
+    {
+        if info.element != Element::Float32 {
+            return Err(wrong(format!(
+                "its {what} `{}` is {}, and `detect` has float32: export the model without \
+                 `half` or `int8`, or call `run`",
+                info.name, info.element
+            )));
+        }
+    }
+    Ok(how)
 }
 
 fn no_detector(name: &str, why: &str) -> InferenceError {

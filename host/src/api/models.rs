@@ -14,7 +14,7 @@ use gleaner_protocol::inference::{
     ModelWait, TENSOR_ALIGNMENT, TensorInfo, TensorPlace,
 };
 use gleaner_protocol::link::LinkError;
-use gleaner_vision::{DetectorLayout, OutputView, Preparer};
+use gleaner_vision::{DetectorLayout, ExportNote, OutputView, Preparer};
 use gleaner_vitals::monotonic_ns;
 use zerocopy::IntoBytes;
 
@@ -87,6 +87,8 @@ pub struct OpenedModel {
     pub outputs: Vec<TensorInfo>,
     /// Backend, version, provider and threads.
     pub runtime: String,
+    /// Statements of its export about a detector.
+    pub note: ExportNote,
 }
 
 /// An input or output in the memory of this process.
@@ -371,14 +373,15 @@ impl Connection {
                 result => break result?.0,
             }
         };
-        let ModelResult::Opened { inputs, outputs, runtime } = result else {
+        let ModelResult::Opened { inputs, outputs, runtime, metadata } = result else {
             return Err(unexpected());
         };
+        let note = ExportNote::of(metadata.iter().map(|(key, value)| (&**key, &**value)));
         let entry = (name.to_owned(), runtime.chars().take(RUNTIME_MAX).collect());
         if self.runtimes.len() < RUNTIMES && !self.runtimes.contains(&entry) {
             self.runtimes.push(entry);
         }
-        let opened = Arc::new(OpenedModel { inputs, outputs, runtime });
+        let opened = Arc::new(OpenedModel { inputs, outputs, runtime, note });
         self.opened.push((name.to_owned(), Arc::clone(&opened)));
         Ok(opened)
     }

@@ -7,7 +7,7 @@ use gleaner_messages::{Endian, MessageValue};
 use gleaner_rules::clamps::Length;
 use gleaner_transport::{SampleMeta, StoredMeta};
 
-use super::data::{DataError, Field, OutOfFuel, Topic};
+use super::data::{DataError, Field, Topic};
 use super::frame::{Frame, ImageMessage};
 use super::shared_bytes::SharedBytes;
 use super::values::{Identity, Stamps};
@@ -34,11 +34,8 @@ impl Sample {
     /// Timestamps of the sample.
     pub fn stamps(&self) -> Stamps {
         let meta = self.meta();
-        let header_ns = self
-            .topic
-            .header
-            .as_ref()
-            .and_then(|header| header.read(&self.lease, meta.endian).ok());
+        let header = self.topic.headers.get(usize::from(meta.layout)).and_then(Option::as_ref);
+        let header_ns = header.and_then(|header| header.read(&self.lease, meta.endian).ok());
         Stamps { at_ns: meta.at_ns, publish_ns: meta.publish_ns, header_ns }
     }
 
@@ -54,7 +51,8 @@ impl Sample {
         field.must_belong_to(&self.topic)?;
         let value = field
             .path
-            .read(&self.lease, self.meta().endian)
+            .in_layout(self.meta().layout)
+            .and_then(|path| path.read(&self.lease, self.meta().endian))
             .map_err(|error| self.topic.unreadable(&field.path, error))?;
         if let Some(number) = number(&value) {
             field.draw(self.meta().at_ns, number);
@@ -96,18 +94,14 @@ impl Sample {
         self.meta().endian == Endian::Big
     }
 
-    /// Bytes from `offset`, `len` at most, clamped to the message and to `call_bytes` of
-    /// `[limits]`.
+    /// Bytes from `offset`: `len`, or fewer where the message ends.
     ///
     /// # Errors
     ///
-    /// [`OutOfFuel`].
-    pub fn cdr(&self, offset: u64, len: u32) -> Result<SharedBytes, OutOfFuel> {
-        let per_call = &self.topic.per_call;
-        let piece =
-            SharedBytes::of_message(&self.lease).part(offset, per_call.bytes.min(len as usize));
-        per_call.charge(|| piece.len())?;
-        Ok(piece)
+    /// [`DataError::TooLong`] for more than `call_bytes` of `[limits]`; [`DataError::OutOfFuel`].
+    pub fn cdr(&self, offset: u64, len: u32) -> Result<SharedBytes, DataError> {
+        let message = SharedBytes::of_message(&self.lease);
+        self.topic.per_call.piece(&message, (offset, len), "sample", &self.topic.topic)
     }
 
     /// Work of [`Sample::as_frame`] in bytes, estimated by the header of the image; 0 if it is
@@ -115,7 +109,7 @@ impl Sample {
     fn decode_work(&self) -> usize {
         match self.picture() {
             Ok(ImageMessage::Compressed(compressed)) => {
-                self.topic.images.decode_work(self.lease.position(), compressed.data)
+                self.topic.images.decode_work(self.lease.position(), &compressed)
             }
             Ok(ImageMessage::Raw(_)) | Err(_) => 0,
         }
@@ -134,6 +128,10 @@ impl Sample {
 
     pub(super) fn picture(&self) -> Result<ImageMessage<'_>, DataError> {
         let Topic { topic, type_name, .. } = &*self.topic;
+        if self.topic.has_other_layout && ImageMessage::is_type(type_name) {
+            let type_name = format!("{type_name}, with other fields than in ROS 2");
+            return Err(DataError::NoImageType { topic: topic.clone(), type_name });
+        }
         ImageMessage::of(type_name, &self.lease, self.meta().endian)
             .map_err(|source| DataError::Malformed {
                 topic: topic.clone(),

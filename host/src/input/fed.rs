@@ -8,7 +8,7 @@ use gleaner_feed::{FedTopic, Feed, FeedError};
 use gleaner_lambda::manifest::{InputSpec, Manifest};
 use gleaner_messages::{Definitions, Sources, SourcesError};
 use gleaner_protocol::ingress::{RefusedTopic, TopicGrant};
-use gleaner_transport::{StoredMeta, TopicCounters, TransportError};
+use gleaner_transport::{StoredMeta, TopicCounters, TransportError, live_definitions};
 use tracing::warn;
 
 use super::{InputError, Remap, SharedLimits, warn_of_missing_definitions};
@@ -43,7 +43,11 @@ pub fn open_fed_inputs(
         let received = |source| InputError::Receive { input: input.name.to_string(), source };
         let local = || local_definitions(sources, input.type_name.as_str());
         let carried = info.definitions;
-        let known = if info.is_recorded { carried.or_else(local) } else { local().or(carried) };
+        let known = if info.is_recorded {
+            carried.or_else(local)
+        } else {
+            live_definitions(&info.type_name, info.type_hash.as_deref(), local(), carried)
+        };
         let text = match known {
             Some(text) => Some(text),
             None => {

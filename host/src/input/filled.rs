@@ -242,7 +242,16 @@ mod tests {
 
     fn meta(seq: u64) -> SampleMeta {
         let (at_ns, writer) = (seq as i64, Guid::default());
-        SampleMeta { at_ns, publish_ns: 0, writer, seq, endian: Endian::Little, options: [0; 2] }
+        SampleMeta {
+            at_ns,
+            publish_ns: 0,
+            writer,
+            seq,
+            endian: Endian::Little,
+            options: [0; 2],
+            layout: 0,
+            is_latched: false,
+        }
     }
 
     #[test]

@@ -49,6 +49,7 @@ pub struct InspectArgs {
 pub fn inspect(args: &InspectArgs, reports: &mut dyn Write) -> Result<Exit, Failure> {
     let options = DriveOptions {
         sources: Some(Sources::new(&[], &definition_dirs())),
+        merge: true,
         ..DriveOptions::default()
     };
     let open = || Replay::open_as(&args.drives, &options).map_err(DriveError);
@@ -64,6 +65,7 @@ pub fn inspect(args: &InspectArgs, reports: &mut dyn Write) -> Result<Exit, Fail
     if parts.is_empty() {
         damaged = read(&mut drive, &mut topics, None).1;
         out_of_order = drive.out_of_order();
+        count_malformed(&drive, &mut topics);
     }
     for (n, part) in parts.iter_mut().enumerate() {
         if n > 0 {
@@ -73,6 +75,7 @@ pub fn inspect(args: &InspectArgs, reports: &mut dyn Write) -> Result<Exit, Fail
         let (until_ns, broken) = read(&mut drive, &mut topics, Some(PART_BYTES));
         part[1] = until_ns.unwrap_or(part[1]);
         out_of_order += drive.out_of_order();
+        count_malformed(&drive, &mut topics);
         damaged = damaged.or(broken);
     }
     let mut topics: Vec<_> = topics.into_iter().map(TopicInspection::into_info).collect();
@@ -87,6 +90,15 @@ pub fn inspect(args: &InspectArgs, reports: &mut dyn Write) -> Result<Exit, Fail
     let info = DriveInfo { start_ns, end_ns, parts, out_of_order, damaged, topics, skipped };
     super::report(reports, &Report::Drive(info));
     Ok(Exit::Ok)
+}
+
+/// Adds the messages that a drive left out; those of a topic with several types to the first.
+fn count_malformed(drive: &Replay, topics: &mut [TopicInspection]) {
+    for (name, messages) in drive.malformed() {
+        if let Some(topic) = topics.iter_mut().find(|topic| topic.info.topic == *name) {
+            topic.info.malformed += messages;
+        }
+    }
 }
 
 /// Returns the topics to inspect, by name, and the number of those left out; topics without
@@ -172,6 +184,9 @@ impl TopicInspection {
             type_name: found.type_name,
             messages: found.messages,
             is_defined: found.definitions_text.is_some(),
+            layouts: u64::from(found.definitions_text.is_some())
+                + found.other_definitions.len() as u64,
+            malformed: 0,
             unreadable: None,
             messages_read: 0,
             interval: None,
@@ -201,6 +216,9 @@ impl TopicInspection {
     }
 
     fn add(&mut self, step: &ReplayStep) {
+        if step.delivery == Delivery::Malformed {
+            return;
+        }
         self.info.messages_read += 1;
         self.info.bytes += step.bytes as u64;
         self.info.largest_bytes = self.info.largest_bytes.max(step.bytes as u64);
@@ -260,7 +278,7 @@ impl FirstMessage {
             }
             "sensor_msgs/msg/CompressedImage" => {
                 let view = CompressedView::read(cdr, meta.endian).ok()?;
-                let header = gleaner_image::probe(view.data).ok()?;
+                let (header, _) = gleaner_image::probe_message(view.format, view.data).ok()?;
                 let encoding = header.format.to_string();
                 Some(PictureInfo {
                     encoding,

@@ -44,6 +44,7 @@ pub(super) fn open(options: &ReplayOptions) -> Result<Replay, ReplayError> {
     let (unpack_in, unpacked) = (options.unpack_in.clone(), options.unpacked.clone());
     let opening = replay::DriveOptions {
         sources: Some(sources),
+        merge: options.merge,
         unpack_in,
         unpacked,
         ..replay::DriveOptions::default()

@@ -25,6 +25,9 @@ pub struct ReplayArgs {
     /// MCAP files, databases and directories of rosbag2; several are merged by time.
     #[arg(required = true)]
     pub drives: Vec<PathBuf>,
+    /// Merge drives that have a topic in common and overlap in time: they are one recording.
+    #[arg(long)]
+    pub merge: bool,
     /// Replay from this time on: seconds after the drive's start, or since 1970 after an `@`.
     #[arg(long, value_name = "TIME")]
     pub from: Option<DriveTime>,
@@ -78,6 +81,8 @@ pub struct ReplayOptions {
     pub lambda: ConfiguredLambda,
     /// The drives, merged by time.
     pub drives: Drives,
+    /// Set if drives that overlap in time may have a topic in common.
+    pub merge: bool,
     /// The time range that is replayed.
     pub range: RequestedRange,
     /// Patterns of the topics that clips hold; empty for those of the manifest.
@@ -230,6 +235,7 @@ impl ReplayJob {
         let options = ReplayOptions {
             lambda,
             drives,
+            merge: args.merge,
             range,
             topics: args.topics,
             unpack_in,

@@ -223,7 +223,16 @@ mod tests {
 
     fn meta(at_ns: i64) -> SampleMeta {
         let (writer, endian) = (Guid::default(), Endian::Little);
-        SampleMeta { at_ns, publish_ns: 0, writer, seq: at_ns as u64, endian, options: [0; 2] }
+        SampleMeta {
+            at_ns,
+            publish_ns: 0,
+            writer,
+            seq: at_ns as u64,
+            endian,
+            options: [0; 2],
+            layout: 0,
+            is_latched: false,
+        }
     }
 
     #[test]

@@ -112,10 +112,8 @@ impl ReplayRecorder {
         let mut is_seen = manifest.inputs.iter().any(|input| is_image(input.type_name.as_str()));
         for name in topic_filter::topics(rules, options, drive, &known)? {
             let name = name.as_str();
-            let found = known
-                .binary_search_by(|topic| topic.topic.as_str().cmp(name))
-                .ok()
-                .map(|at| &known[at]);
+            // The first of several types has the most messages.
+            let found = known.iter().find(|topic| topic.topic == name);
             if found.is_none() {
                 tracing::warn!(
                     topic = %name,
@@ -257,6 +255,7 @@ fn topic(name: &str, found: Option<&DiscoveredTopic>) -> TopicSchema {
         name: name.to_owned(),
         type_name: found.map(|topic| topic.type_name.clone()).unwrap_or_default(),
         definitions: found.and_then(|topic| topic.definitions_text.clone()),
+        other_definitions: found.map(|topic| topic.other_definitions.clone()).unwrap_or_default(),
         offered_qos: found.and_then(|topic| topic.offered_qos.clone()),
     }
 }

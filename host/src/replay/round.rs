@@ -199,6 +199,7 @@ impl ReplayLoop<'_> {
                 .fold(0, |sum: u64, counts| sum.saturating_add(counts.skipped)),
             missed_ticks: self.schedule.missed(),
             out_of_order: drive.out_of_order(),
+            malformed: drive.malformed().clone(),
             log_lines: self.log_lines,
             log_dropped: self.session.log_dropped(),
             triggers_refused: self.session.triggers_refused(),

@@ -146,6 +146,8 @@ fn model_entry(model: &ModelSpec, build: &BuildDir) -> Result<ModelEntry, Failur
             PlainFile::inside(build.path(), file.as_path(), LABELS_MAX)
                 .and_then(|mut file| file.read_to_string(&mut text))
                 .map_err(failed)?;
+            // Editors of Windows begin a file with a byte order mark.
+            let text = text.trim_start_matches('\u{feff}');
             text.lines().map(|line| line.trim().to_owned()).collect()
         }
     };

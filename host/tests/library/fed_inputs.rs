@@ -55,8 +55,16 @@ impl FedInputs {
     /// Publishes a sample of input `number`.
     fn publish(&self, number: u32, value: i64) {
         let (writer, endian, seq) = (Guid([7; 16]), Endian::Little, value as u64);
-        let meta =
-            SampleMeta { at_ns: value, publish_ns: value, writer, seq, endian, options: [0; 2] };
+        let meta = SampleMeta {
+            at_ns: value,
+            publish_ns: value,
+            writer,
+            seq,
+            endian,
+            options: [0; 2],
+            layout: 0,
+            is_latched: false,
+        };
         let cdr = value.to_le_bytes();
         self.loopback.publish(&topic(number), &meta, &cdr).unwrap();
     }

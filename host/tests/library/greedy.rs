@@ -192,7 +192,16 @@ pub fn subscribed(manifest: &Manifest, definition: &str) -> (Loopback, Arc<Topic
 /// If there is no such topic.
 pub fn publish(transport: &mut Loopback, topic: &str, seq: u64, cdr: &[u8]) {
     let (at_ns, writer, endian, options) = (seq as i64, Guid::default(), Endian::Little, [0; 2]);
-    let meta = SampleMeta { at_ns, publish_ns: at_ns, writer, seq, endian, options };
+    let meta = SampleMeta {
+        at_ns,
+        publish_ns: at_ns,
+        writer,
+        seq,
+        endian,
+        options,
+        layout: 0,
+        is_latched: false,
+    };
     transport.publish(topic, &meta, cdr).expect("a topic");
 }
 

@@ -123,6 +123,8 @@ impl DriverGuest {
             seq,
             endian,
             options: [0; 2],
+            layout: 0,
+            is_latched: false,
         };
         self.transport.publish(topic, &meta, cdr).unwrap();
     }

@@ -8,7 +8,7 @@ use gleaner_host::api::data::{DataError, PATH_BYTES, SAMPLES_PER_CALL, TEXTS_PER
 use gleaner_host::guest::Guest;
 use gleaner_lambda::FaultKind;
 use gleaner_lambda::manifest::{Limits, Manifest};
-use gleaner_tests::drive::{CdrBuilder, IMAGE, image};
+use gleaner_tests::drive::{COMPRESSED, CdrBuilder, IMAGE, image};
 use gleaner_vitals::usage;
 
 /// Maximum result of one call.
@@ -287,13 +287,19 @@ fn the_error_of_a_column_is_that_of_its_oldest_unreadable_sample() {
 }
 
 #[test]
-fn one_call_hands_out_one_mebibyte_of_a_message() {
+fn a_call_that_would_hand_out_more_than_one_mebibyte_of_a_message_is_refused() {
     let bytes = vec![7; BYTES_PER_CALL + 1];
     let topic =
         topic(only("uint8[] x\n"), 1, "2 MiB", 1, &CdrBuilder::default().bytes(&bytes).done());
     let sample = topic.newest().unwrap().unwrap();
     let size = sample.bytes().len() as u64;
-    assert_eq!(sample.cdr(0, u32::MAX).unwrap().len(), BYTES_PER_CALL);
+    let most = BYTES_PER_CALL as u32;
+    assert_eq!(sample.cdr(1, most).unwrap().len(), BYTES_PER_CALL);
+    for len in [most + 1, u32::MAX] {
+        let Err(error) = sample.cdr(0, len) else { panic!("{len} bytes are returned") };
+        assert!(error.to_string().contains("of a sample of `/many` are requested"), "{error}");
+        assert!(error.to_string().contains("at most 1048576: read it in pieces"), "{error}");
+    }
     for (offset, left) in [(size - 3, 3), (size, 0), (size + 1, 0), (u64::MAX, 0)] {
         assert_eq!(sample.cdr(offset, u32::MAX).unwrap().len(), left);
     }
@@ -304,7 +310,7 @@ fn one_call_hands_out_one_mebibyte_of_a_message() {
 }
 
 #[test]
-fn one_call_hands_out_one_mebibyte_of_a_frame() {
+fn a_call_that_would_hand_out_more_than_one_mebibyte_of_a_frame_is_refused() {
     let cdr = image(700, 600, "rgb8", 2100, &vec![9; 1_260_000]);
     let frame = topic(("sensor_msgs/msg/Image", IMAGE), 1, "2 MiB", 1, &cdr)
         .newest()
@@ -313,9 +319,47 @@ fn one_call_hands_out_one_mebibyte_of_a_frame() {
         .as_frame()
         .unwrap();
     let size = 1_260_000;
-    assert_eq!(frame.read(0, u32::MAX).unwrap().len(), BYTES_PER_CALL);
+    assert_eq!(frame.read(7, BYTES_PER_CALL as u32).unwrap().len(), BYTES_PER_CALL);
+    let Err(error) = frame.read(0, u32::MAX) else { panic!("a part is returned") };
+    assert!(error.to_string().starts_with("1260000 bytes of a frame of `/many`"), "{error}");
     for (offset, left) in [(size - 3, 3), (size, 0), (u64::MAX, 0)] {
         assert_eq!(frame.read(offset, u32::MAX).unwrap().len(), left);
+    }
+}
+
+#[test]
+fn depth_keeps_its_16_bits_from_the_message_to_the_frame() {
+    // PNG of 16-bit grey, 4x2 pixels, by Pillow.
+    let file = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\0\0\x04\0\0\0\x02\x10\0\0\0\0\nS\xfe\xfc\0\0\0\
+        \x1aIDATx\xdac````d\xf8\xcf\xc8\xc0\xc0\xfc\x82\x93e\x8e\xc3\xff\xff\0\x19\x06\x04\xd4\x0c\
+        \xa7\xf5\xe7\0\0\0\0IEND\xaeB`\x82";
+    let values: Vec<u8> =
+        [0, 1, 255, 256, 1_000, 2_308, 40_000, 65_535_u16].map(u16::to_le_bytes).concat();
+    let frame = |format: &str, data: &[u8]| {
+        let cdr = CdrBuilder::header().text(format).bytes(data).done();
+        let definition = ("sensor_msgs/msg/CompressedImage", COMPRESSED);
+        topic(definition, 1, "1 MiB", 1, &cdr).newest().unwrap().unwrap().as_frame()
+    };
+    let after = [&[0; 12], &file[..]].concat();
+    for (format, data) in [
+        ("16UC1; png compressed ", &file[..]),
+        ("16UC1; compressedDepth", &after),
+        ("16UC1; compressedDepth png", &after),
+    ] {
+        let frame = frame(format, data).unwrap();
+        assert_eq!(frame.info().encoding, gleaner_image::Encoding::Mono16, "{format}");
+        assert_eq!(frame.bytes(), values, "{format}");
+        let error = frame.resize(2, 1).err().unwrap().to_string();
+        assert!(error.contains("resize of mono16 would keep 8 of its 16 bits"), "{error}");
+        assert_eq!(frame.to_gray().unwrap().bytes(), [0, 0, 0, 1, 3, 9, 156, 255]);
+    }
+    for (format, why) in [
+        ("32FC1; compressedDepth png", "32FC1 has 32 bits per value, and the PNG has 16"),
+        ("compressedDepth", "name the encoding, as in `16UC1; compressedDepth png`"),
+        ("png", "publish JPEG or PNG, depth as `16UC1; compressedDepth png`"),
+    ] {
+        let error = frame(format, &after).err().unwrap().to_string();
+        assert!(error.contains(why), "{error}");
     }
 }
 

@@ -300,6 +300,8 @@ impl Running {
             seq,
             endian: Endian::Little,
             options: [0; 2],
+            layout: 0,
+            is_latched: false,
         };
         self.loopback.publish(NUMBERS, &meta, &value.to_le_bytes()).unwrap();
     }

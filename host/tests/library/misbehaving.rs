@@ -77,6 +77,8 @@ impl MisbehavingGuest {
             seq: self.sent,
             endian: Endian::Little,
             options: [0; 2],
+            layout: 0,
+            is_latched: false,
         };
         self.transport.publish("/imu/data", &meta, &[0; 24]).unwrap();
         self.session.begin(at_ns);

@@ -402,6 +402,8 @@ fn publish(
         seq: *sent,
         endian: Endian::Little,
         options: [0; 2],
+        layout: 0,
+        is_latched: false,
     };
     let mut cdr = value.to_le_bytes().to_vec();
     cdr.resize(len, 0);

@@ -85,6 +85,8 @@ fn send(transport: &mut Loopback, seq: u64, cdr: &[u8]) {
         seq,
         endian: Endian::Little,
         options: [0; 2],
+        layout: 0,
+        is_latched: false,
     };
     transport.publish("/imu/data", &meta, cdr).unwrap();
 }

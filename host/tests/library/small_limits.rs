@@ -199,7 +199,9 @@ fn the_bytes_that_one_call_returns_are_limited() {
         &CdrBuilder::default().bytes(&bytes).done(),
     );
     let sample = topic.newest().unwrap().unwrap();
-    assert_eq!(sample.cdr(0, u32::MAX).unwrap().len(), 64 << 10);
+    assert_eq!(sample.cdr(9, 64 << 10).unwrap().len(), 64 << 10);
+    let Err(error) = sample.cdr(0, u32::MAX) else { panic!("a part is returned") };
+    assert!(error.to_string().contains("one call returns at most 65536: read it"), "{error}");
     let error = sample.get(&topic.field("x").unwrap()).map(drop).unwrap_err();
     assert!(
         error.to_string().contains("has 100000 items; one call returns at most 65536"),

@@ -18,5 +18,5 @@ pub use live::{LiveSource, PublishError, Publisher};
 pub use stored::{ArrivalSums, STORED_WORDS, StoredMeta, TopicCounters};
 pub use transport::{
     DefinitionsSearch, Delivery, DiscoveredTopic, Guid, SampleMeta, Sink, Subscription, TopicSpec,
-    Transport, TransportError, same_type,
+    Transport, TransportError, live_definitions, same_type,
 };

@@ -116,6 +116,8 @@ impl Transport for Loopback {
             topic: name.clone(),
             type_name: topic.type_name.clone(),
             definitions_text: topic.text.clone(),
+            type_hash: None,
+            other_definitions: Vec::new(),
             messages: Some(topic.messages),
             offered_qos: None,
         };
@@ -209,6 +211,8 @@ impl Publisher for LoopbackPublisher {
             seq,
             endian: Endian::Little,
             options: [0; 2],
+            layout: 0,
+            is_latched: false,
         };
         self.loopback
             .publish(&self.topic, &meta, cdr)

@@ -29,7 +29,9 @@ impl StoredMeta {
         let [second, third] = sample.options;
         let flags = u64::from(sample.endian == Endian::Big)
             | u64::from(second) << 8
-            | u64::from(third) << 16;
+            | u64::from(third) << 16
+            | u64::from(sample.layout) << 24
+            | u64::from(sample.is_latched) << 40;
         [
             sample.at_ns.cast_unsigned(),
             sample.publish_ns.cast_unsigned(),
@@ -59,6 +61,8 @@ impl StoredMeta {
             seq,
             endian: if flags & 1 == 1 { Endian::Big } else { Endian::Little },
             options: [(flags >> 8) as u8, (flags >> 16) as u8],
+            layout: (flags >> 24) as u16,
+            is_latched: flags >> 40 & 1 == 1,
         };
         Self { sample, digests: digests as u32, refused }
     }
@@ -159,6 +163,8 @@ mod tests {
             seq: u64::MAX,
             endian: Endian::Big,
             options: [3, 250],
+            layout: 0xfff1,
+            is_latched: true,
         };
         let stored = StoredMeta { sample, digests: u32::MAX, refused: 5 };
         assert_eq!(StoredMeta::of_words(&stored.words()), stored);
@@ -177,6 +183,8 @@ mod tests {
             seq,
             endian: Endian::Little,
             options: [0; 2],
+            layout: 0,
+            is_latched: false,
         };
         let (mut sums, mut later) = (ArrivalSums::default(), ArrivalSums::default());
         assert_eq!(sums.add(&meta(1), b"one").digests, 0, "digests are off");

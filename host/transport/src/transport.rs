@@ -4,7 +4,7 @@ use std::fmt;
 use std::sync::Arc;
 
 use gleaner_base::text::hint;
-use gleaner_messages::{Definitions, Endian, MessageError, SourcesError};
+use gleaner_messages::{Definitions, Endian, MessageError, SourcesError, type_description};
 use gleaner_protocol::ingress::{Qos, ReceptionStatus};
 
 /// A topic that a caller wants to receive.
@@ -71,6 +71,11 @@ pub struct SampleMeta {
     /// Bytes 2 and 3 of the encapsulation header, nearly always zeros. Unused, but with them a
     /// recorder can write the original message byte for byte.
     pub options: [u8; 2],
+    /// Number of its layout among those of its topic: that of [`Definitions::layouts`].
+    pub layout: u16,
+    /// True for a sample from before a clip that was still valid at its begin, which is then its
+    /// time: that of a topic with durability transient local.
+    pub is_latched: bool,
 }
 
 /// The result of delivering a sample to a sink.
@@ -82,6 +87,8 @@ pub enum Delivery {
     NoSlot,
     /// Dropped: larger than the sink's limit.
     TooBig,
+    /// Left out before the sink: no CDR, or without a time that exists.
+    Malformed,
 }
 
 /// Takes samples of one topic.
@@ -119,6 +126,10 @@ pub struct DiscoveredTopic {
     pub type_name: String,
     /// ros2msg text of the type and all types it refers to, if the source carries it.
     pub definitions_text: Option<Arc<str>>,
+    /// The same for further layouts of the type that the source carries, from number 1 on.
+    pub other_definitions: Vec<Arc<str>>,
+    /// Hash (RIHS01) of the layout that is received, if the writers announce one.
+    pub type_hash: Option<String>,
     /// Number of messages in the source, if known.
     pub messages: Option<u64>,
     /// The QoS that the topic's writers offered, as rosbag2 writes it: YAML under the key
@@ -150,7 +161,8 @@ pub trait Transport {
         sink: Arc<dyn Sink>,
     ) -> Result<Subscription, TransportError>;
 
-    /// Returns the parsed message definitions of a topic, shared by all callers.
+    /// Returns the parsed message definitions of a topic in all of its layouts, shared by all
+    /// callers; of a topic with several types, those of the subscribed one.
     ///
     /// # Errors
     ///
@@ -239,6 +251,14 @@ pub enum TransportError {
         /// The cause.
         source: Box<SourcesError>,
     },
+    /// The layout of some messages of the topic is unknown.
+    #[error("the layout of some messages of topic `{topic}` is unknown: {why}")]
+    UnknownLayout {
+        /// The topic.
+        topic: String,
+        /// The cause.
+        why: &'static str,
+    },
     /// The replay has begun: subscriptions are made before the first step.
     #[error("topic `{topic}` was subscribed after the replay started")]
     AlreadyStarted {
@@ -258,6 +278,21 @@ fn list(names: &[String]) -> String {
         }
         _ => names.join(", "),
     }
+}
+
+/// Chooses the definitions of a live topic: `local` ones, if they have the hash that its writers
+/// announce, or if they announce none; otherwise those that the source `carried` from its nodes.
+pub fn live_definitions<T: AsRef<str>>(
+    type_name: &str,
+    type_hash: Option<&str>,
+    local: Option<T>,
+    carried: Option<T>,
+) -> Option<T> {
+    let fits = |text: &T| {
+        let own = || type_description::type_hash(type_name, text.as_ref());
+        type_hash.is_none_or(|announced| own().is_ok_and(|own| own == announced))
+    };
+    local.filter(fits).or(carried)
 }
 
 /// Returns whether two message type names mean the same type: `pkg/msg/Type` equals `pkg/Type`.
@@ -297,6 +332,20 @@ mod tests {
     fn both_spellings_of_a_type_are_equal() {
         assert!(same_type("sensor_msgs/msg/Imu", "sensor_msgs/Imu"));
         assert!(!same_type("sensor_msgs/msg/Imu", "sensor_msgs/msg/Image"));
+    }
+
+    #[test]
+    fn local_definitions_are_used_only_with_the_announced_hash() {
+        // Published by ROS 2 for `std_msgs/msg/String`.
+        let hash = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18";
+        let choose = |hash, local, carried| {
+            live_definitions("std_msgs/msg/String", hash, Some(local), carried)
+        };
+        let (right, stale) = ("# a text\nstring data", "string data\nint8 more");
+        assert_eq!(choose(Some(hash), right, Some("node's")), Some(right));
+        assert_eq!(choose(Some(hash), stale, Some("node's")), Some("node's"));
+        assert_eq!(choose(Some(hash), stale, None), None);
+        assert_eq!(choose(None, stale, Some("node's")), Some(stale));
     }
 
     #[test]

@@ -19,6 +19,8 @@ fn meta(at_ns: i64) -> SampleMeta {
         seq: 1,
         endian: Endian::Little,
         options: [0; 2],
+        layout: 0,
+        is_latched: false,
     }
 }
 

@@ -13,6 +13,9 @@ pub const MAX_DETECTIONS: u32 = 1024;
 /// Largest number of objects whose boxes are compared; of more, those with the highest scores.
 pub const MAX_CANDIDATES: usize = 4096;
 
+/// Pixels below which all boxes of a model end that are not in pixels.
+const NORMALISED_MAX: f32 = 2.0;
+
 /// An output of a model, in row-major order.
 #[derive(Debug, Clone, Copy)]
 pub struct OutputView<'a> {
@@ -74,13 +77,14 @@ pub struct Detection {
 ///
 /// An anchor of the model gives at most one object: of its best class among the wanted ones. Of
 /// overlapping objects of a class, the one with the highest score stays. Boxes are clipped to the
-/// frame; those without an area there, and objects with a number that is not finite, are dropped.
+/// frame; those without an area there, and those with a number that is not finite, are dropped.
 /// At most the [`MAX_CANDIDATES`] best objects are compared, so that no output takes long.
 ///
 /// # Errors
 ///
 /// [`VisionError::OutputShape`] and [`VisionError::OutputLength`] for outputs that do not fit
-/// `layout`, [`VisionError::Class`], [`VisionError::Fraction`], and [`VisionError::Placed`].
+/// `layout`, [`VisionError::Score`] and [`VisionError::Normalised`] for numbers that do not,
+/// [`VisionError::Class`], [`VisionError::Fraction`], and [`VisionError::Placed`].
 pub fn detect(
     layout: DetectorLayout,
     outputs: &[OutputView<'_>],
@@ -105,9 +109,29 @@ pub fn detect(
         return Err(VisionError::Class { class: *last, classes });
     }
     let classes = listed.as_deref().map_or(Classes::All, Classes::Some);
-    let mut candidates = head.candidates(&classes, wanted.min_score);
+    let layout = layout.name();
+    let mut candidates = head
+        .candidates(&classes, wanted.min_score)
+        .map_err(|value| VisionError::Score { layout, value })?;
     keep_best(&mut candidates, MAX_CANDIDATES);
+    if are_normalised(&head, &candidates) {
+        return Err(VisionError::Normalised { layout, limit: NORMALISED_MAX });
+    }
     Ok(select(&head, &candidates, placed, wanted))
+}
+
+/// Returns whether there are objects, and the boxes of all end where boxes from 0 to 1 do.
+fn are_normalised(head: &DetectorHead<'_>, candidates: &[Candidate]) -> bool {
+    if !matches!(head.form.layout, DetectorLayout::Ultralytics | DetectorLayout::NmsFree) {
+        return false;
+    }
+    // Rows of padding have the score 0.
+    let mut objects = candidates.iter().filter(|candidate| candidate.score > 0.0).peekable();
+    let ends_early = |candidate: &Candidate| {
+        let [_, _, right, bottom] = head.edges(candidate.anchor);
+        right.max(bottom) <= NORMALISED_MAX
+    };
+    objects.peek().is_some() && objects.all(ends_early)
 }
 
 /// Checks the outputs.
@@ -214,10 +238,9 @@ fn in_frame(
     let (x, y) = (left.clamp(0.0, frame_width), top.clamp(0.0, frame_height));
     let width = right.clamp(0.0, frame_width) - x;
     let height = bottom.clamp(0.0, frame_height) - y;
-    let score = candidate.score.min(1.0);
     (width > 0.0 && height > 0.0).then_some(Detection {
         class: candidate.class,
-        score,
+        score: candidate.score,
         x,
         y,
         width,

@@ -97,6 +97,40 @@ pub enum VisionError {
         /// Shapes of the outputs.
         found: String,
     },
+    /// A model that no layout decodes.
+    #[error(
+        "layout `{layout}` cannot decode this model, which is {kind}: call `run`, and decode its \
+         output in the lambda, or use a detector of one of the families in docs/models.md"
+    )]
+    OtherModel {
+        /// Name of the layout.
+        layout: &'static str,
+        /// The family or the task of the model.
+        kind: String,
+    },
+    /// A score that no detector gives.
+    #[error(
+        "the model returned {value} as a score of layout `{layout}`; scores are 0 to 1: the model \
+         is of another family, or its input is not as `layout` states"
+    )]
+    Score {
+        /// Name of the layout.
+        layout: &'static str,
+        /// The number in the place of a score.
+        value: f32,
+    },
+    /// Boxes that are not in pixels.
+    #[error(
+        "all boxes that the model returned end below {limit} pixels, and layout `{layout}` has \
+         boxes in pixels of the input: the model is of another family, such as RT-DETR, or was \
+         exported with boxes from 0 to 1"
+    )]
+    Normalised {
+        /// Name of the layout.
+        layout: &'static str,
+        /// The largest edge of such boxes.
+        limit: f32,
+    },
     /// An output whose number of values contradicts its shape.
     #[error("output {shape} of the model has {found} values")]
     OutputLength {

@@ -26,62 +26,84 @@ pub(crate) struct DetectorHead<'a> {
 impl<'a> DetectorHead<'a> {
     /// Returns the objects of `classes`, which the model has, with at least `min_score`: of each
     /// anchor, the class with the highest score; of equal scores, the first class.
-    pub(crate) fn candidates(&self, classes: &Classes<'_>, min_score: f32) -> Vec<Candidate> {
+    ///
+    /// # Errors
+    ///
+    /// A number that was read as a score, and is none.
+    pub(crate) fn candidates(
+        &self,
+        classes: &Classes<'_>,
+        min_score: f32,
+    ) -> Result<Vec<Candidate>, f32> {
         let mut candidates = Vec::new();
         let mut add = |anchor, score: f32, class| {
-            // False for NaN.
-            if score >= min_score && score.is_finite() {
+            if score >= min_score {
                 candidates.push(Candidate { score, class, anchor });
             }
         };
         if self.form.by_number {
-            let (scores, classes) = self.best_by_number(classes);
+            let (scores, classes) = self.best_by_number(classes)?;
             for (anchor, (score, class)) in scores.into_iter().zip(classes).enumerate() {
                 add(anchor, score, class);
             }
-            return candidates;
+            return Ok(candidates);
         }
         for (anchor, row) in self.values.chunks_exact(self.form.numbers).enumerate() {
-            if let Some((score, class)) = self.best_of(row, classes, min_score) {
+            if let Some((score, class)) = self.best_of(row, classes, min_score)? {
                 add(anchor, score, class);
             }
         }
-        candidates
+        Ok(candidates)
     }
 
     /// Returns the highest score of a row of numbers, and its class.
-    fn best_of(&self, row: &[f32], classes: &Classes<'_>, min_score: f32) -> Option<(f32, u32)> {
+    fn best_of(
+        &self,
+        row: &[f32],
+        classes: &Classes<'_>,
+        min_score: f32,
+    ) -> Result<Option<(f32, u32)>, f32> {
         match self.form.layout {
             DetectorLayout::Ultralytics => classes.best(&row[BOX..]),
             DetectorLayout::Yolox => {
+                let objectness = checked(row[BOX])?;
                 // No score of a class exceeds 1, so most rows end here.
-                let objectness = Some(row[BOX]).filter(|objectness| *objectness >= min_score)?;
-                let (score, class) = classes.best(&row[BOX + 1..])?;
-                Some((objectness * score, class))
+                if objectness < min_score {
+                    return Ok(None);
+                }
+                let best = classes.best(&row[BOX + 1..])?;
+                Ok(best.map(|(score, class)| (objectness * score, class)))
             }
             DetectorLayout::Nanodet => classes.best(&row[..row.len() - SIDES * BINS]),
             DetectorLayout::NmsFree => {
-                let class = class_of(row[BOX + 1])?;
-                classes.contains(class).then_some((row[BOX], class))
+                let score = checked(row[BOX])?;
+                let class = class_of(row[BOX + 1]).filter(|class| classes.contains(*class));
+                Ok(class.map(|class| (score, class)))
             }
         }
     }
 
     /// Returns the highest score of each anchor and its class, where the scores of a class are next
     /// to each other. Only rows of wanted classes are read.
-    fn best_by_number(&self, classes: &Classes<'_>) -> (Vec<f32>, Vec<u32>) {
+    fn best_by_number(&self, classes: &Classes<'_>) -> Result<(Vec<f32>, Vec<u32>), f32> {
         let mut best = vec![f32::NEG_INFINITY; self.form.anchors];
         let mut best_classes = vec![0; self.form.anchors];
+        let mut refused = None;
         classes.each(self.form.classes.unwrap_or(0), |class| {
             let scores = self.row(BOX + class as usize);
+            let mut are_scores = true;
             for ((best, best_class), score) in best.iter_mut().zip(&mut best_classes).zip(scores) {
-                // Both are written in any case: a CPU does that for several anchors at once.
+                // All are written in any case: a CPU does that for several anchors at once.
                 let is_better = *score > *best;
                 *best = if is_better { *score } else { *best };
                 *best_class = if is_better { class } else { *best_class };
+                are_scores &= is_score(*score);
+            }
+            if !are_scores {
+                refused = refused.or(scores.iter().copied().find(|score| !is_score(*score)));
             }
         });
-        (best, best_classes)
+        refused.map_or(Ok((best, best_classes)), Err)
     }
 
     /// Returns number `number` of all anchors, where these are next to each other.
@@ -168,22 +190,36 @@ impl Classes<'_> {
     }
 
     /// Returns the highest of `scores`, which begin with class 0, and its class.
-    fn best(&self, scores: &[f32]) -> Option<(f32, u32)> {
-        let mut best = (f32::NEG_INFINITY, 0);
-        let mut add = |score: f32, class: u32| {
-            if score > best.0 {
-                best = (score, class);
+    fn best(&self, scores: &[f32]) -> Result<Option<(f32, u32)>, f32> {
+        let mut best = None;
+        let mut add = |score: f32, class: u32| -> Result<(), f32> {
+            let score = checked(score)?;
+            if best.is_none_or(|(highest, _)| score > highest) {
+                best = Some((score, class));
             }
+            Ok(())
         };
         match self {
-            Self::All => scores.iter().zip(0..).for_each(|(score, class)| add(*score, class)),
+            Self::All => {
+                scores.iter().zip(0..).try_for_each(|(score, class)| add(*score, class))?;
+            }
             Self::Some(classes) => classes
                 .iter()
                 .filter_map(|class| scores.get(*class as usize).map(|score| (*score, *class)))
-                .for_each(|(score, class)| add(score, class)),
+                .try_for_each(|(score, class)| add(score, class))?,
         }
-        (best.0 > f32::NEG_INFINITY).then_some(best)
+        Ok(best)
     }
+}
+
+/// Returns whether a number can be a score; NaN cannot.
+fn is_score(value: f32) -> bool {
+    (0.0..=1.0).contains(&value)
+}
+
+/// Returns a score, or the number as the error.
+fn checked(value: f32) -> Result<f32, f32> {
+    if is_score(value) { Ok(value) } else { Err(value) }
 }
 
 /// Returns the class that a model returns as a float.

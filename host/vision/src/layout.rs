@@ -1,6 +1,7 @@
 //! Families of detectors: the form of their input and of their output.
 
 use crate::error::{VisionError, shape_text, shortened};
+use crate::export::ExportNote;
 use crate::placement::Placement;
 use crate::prepare::Preprocess;
 
@@ -16,8 +17,18 @@ pub(crate) const BINS: usize = 8;
 /// Numbers of a row of an NMS-free detector: box, score, class.
 const NMS_FREE_ROW: u32 = 6;
 
-/// Strides of the grids of YOLOX.
+/// Strides of the grids of YOLOX, and usual ones of Ultralytics.
 const YOLOX_STRIDES: &[u32] = &[8, 16, 32];
+
+/// Strides of the models P2 and P6 of Ultralytics, whose metadata has the largest.
+const P2_STRIDES: &[u32] = &[4, 8, 16, 32];
+const P6_STRIDES: &[u32] = &[8, 16, 32, 64];
+
+/// Rows of the output of RT-DETR.
+const RT_DETR_ROWS: u32 = 300;
+
+/// Anchors of a cell in YOLOv5 and YOLOv7.
+const YOLO_V5_ANCHORS: u64 = 3;
 
 /// Strides of the grids of NanoDet-Plus; older ones lack the last.
 const NANODET_STRIDES: &[u32] = &[8, 16, 32, 64];
@@ -27,6 +38,8 @@ const NANODET_STRIDES: &[u32] = &[8, 16, 32, 64];
 pub enum DetectorLayout {
     /// YOLOv8, YOLO11 and others of Ultralytics: one output [1, 4 + classes, anchors], or the same
     /// transposed, of boxes by centre and size in pixels of the tensor, and scores of the classes.
+    /// There is an anchor for each cell of grids with strides 8, 16 and 32, and 4 or 64 if the
+    /// metadata has the largest stride.
     Ultralytics,
     /// YOLOX, exported without `--decode_in_inference`: one output [1, cells, 5 + classes] of boxes
     /// relative to cells of grids with strides 8, 16 and 32, objectness, and scores of the classes.
@@ -129,22 +142,33 @@ impl DetectorLayout {
         Ok(how)
     }
 
-    /// Checks the outputs of a model of this family, whose input has `width` x `height` pixels, and
-    /// returns the number of its classes, if the shape shows it. Lengths that are not fixed pass;
-    /// [`detect`](crate::detect()) checks them for each result.
+    /// Checks the outputs of a model of this family, whose input has `width` x `height` pixels and
+    /// whose export wrote `note`, and returns the number of its classes, if the shape shows it.
+    /// Lengths that are not fixed pass; [`detect`](crate::detect()) checks them for each result.
     ///
     /// # Errors
     ///
+    /// [`VisionError::OtherModel`] for one that is known to be of another family, and
     /// [`VisionError::OutputShape`] with the shapes of both.
     pub fn check(
         self,
         outputs: &[&[Option<u32>]],
         (width, height): (u32, u32),
+        note: &ExportNote,
     ) -> Result<Option<u32>, VisionError> {
         let fixed = |shape: &[Option<u32>]| shape.iter().copied().collect::<Option<Vec<u32>>>();
+        let shapes = outputs.iter().filter_map(|shape| fixed(shape)).collect::<Vec<_>>();
+        let kind = note.foreign_kind().or_else(|| self.foreign_shape(&shapes, (width, height)));
+        if let Some(kind) = kind {
+            return Err(VisionError::OtherModel { layout: self.name(), kind });
+        }
+        let has_stride = |form: &Form| {
+            form.strides == YOLOX_STRIDES || note.stride == form.strides.last().copied()
+        };
+        let is_proven = |form: &Form| self != Self::Ultralytics || has_stride(form);
         let form = match *outputs {
             [shape] => match fixed(shape) {
-                Some(shape) => self.form_of(&shape, (width, height)),
+                Some(shape) => self.form_of(&shape, (width, height)).filter(is_proven),
                 None if matches!(*shape, [None | Some(1), _, _]) => return Ok(None),
                 None => None,
             },
@@ -153,6 +177,34 @@ impl DetectorLayout {
         let texts = outputs.iter().take(8).map(|shape| shape_text(shape.iter().copied()));
         form.map(|form| form.classes)
             .ok_or_else(|| self.refusal((width, height), texts.collect::<Vec<_>>().join(", ")))
+    }
+
+    /// Returns the kind of a model that no layout decodes, if the shapes of its outputs show it.
+    fn foreign_shape(self, shapes: &[Vec<u32>], input: (u32, u32)) -> Option<String> {
+        let cells = cells(YOLOX_STRIDES, input);
+        let kind = match shapes {
+            [first, masks] if first.len() == 3 && masks.len() == 4 => "a segmentation model",
+            [shape] => match shape[..] {
+                [1, rows, columns]
+                    if columns > 5
+                        && [YOLOX_STRIDES, P6_STRIDES].iter().any(|strides| {
+                            u64::from(rows) == YOLO_V5_ANCHORS * self::cells(strides, input)
+                        }) =>
+                {
+                    "YOLOv5 or YOLOv7, with three anchors in each cell"
+                }
+                [1, RT_DETR_ROWS, columns]
+                    if self == Self::Ultralytics
+                        && columns > NMS_FREE_ROW
+                        && ![u64::from(RT_DETR_ROWS), u64::from(columns)].contains(&cells) =>
+                {
+                    "RT-DETR, with 300 rows"
+                }
+                _ => return None,
+            },
+            _ => return None,
+        };
+        Some(kind.to_owned())
     }
 
     /// Returns the form of an output of `shape`.
@@ -188,7 +240,9 @@ impl DetectorLayout {
         let by_number = self == Self::Ultralytics && is_by_number(rows, columns, input);
         let (anchors, numbers) = if by_number { (columns, rows) } else { (rows, columns) };
         let strides = match self {
-            Self::Ultralytics if anchors > 0 => &[],
+            Self::Ultralytics => [YOLOX_STRIDES, P2_STRIDES, P6_STRIDES]
+                .into_iter()
+                .find(|strides| cells(strides) == u64::from(anchors))?,
             Self::NmsFree if numbers == NMS_FREE_ROW => &[],
             Self::Yolox if cells(YOLOX_STRIDES) == u64::from(anchors) => YOLOX_STRIDES,
             Self::Nanodet => [NANODET_STRIDES, &NANODET_STRIDES[..3]]
@@ -208,15 +262,12 @@ impl DetectorLayout {
 }
 
 /// Returns whether an output [1, `rows`, `columns`] of Ultralytics has a row for each number.
-///
-/// The number of anchors is known for the usual strides; otherwise there are more anchors than
-/// numbers.
 fn is_by_number(rows: u32, columns: u32, input: (u32, u32)) -> bool {
-    let anchors = cells(YOLOX_STRIDES, input);
-    if u64::from(columns) == anchors {
-        return true;
-    }
-    u64::from(rows) != anchors && rows <= columns
+    let is_anchors = |length: u32| {
+        let grids = [YOLOX_STRIDES, P2_STRIDES, P6_STRIDES];
+        grids.iter().any(|strides| cells(strides, input) == u64::from(length))
+    };
+    is_anchors(columns) || !is_anchors(rows)
 }
 
 /// Returns the number of cells of all grids.
@@ -233,7 +284,7 @@ mod tests {
     const INPUT: (u32, u32) = (416, 416);
 
     fn refusal(layout: DetectorLayout, outputs: &[&[Option<u32>]]) -> String {
-        layout.check(outputs, INPUT).unwrap_err().to_string()
+        layout.check(outputs, INPUT, &ExportNote::default()).unwrap_err().to_string()
     }
 
     #[test]
@@ -293,19 +344,18 @@ mod tests {
     #[test]
     fn the_outputs_show_the_number_of_classes() {
         let classes = |layout: DetectorLayout, shape: [u32; 3]| {
-            layout.check(&[&shape.map(Some)], INPUT).unwrap()
+            layout.check(&[&shape.map(Some)], INPUT, &ExportNote::default()).unwrap()
         };
         assert_eq!(classes(DetectorLayout::Yolox, [1, 3549, 85]), Some(80));
         assert_eq!(classes(DetectorLayout::Ultralytics, [1, 84, 3549]), Some(80));
         assert_eq!(classes(DetectorLayout::Ultralytics, [1, 3549, 84]), Some(80));
-        // Of a model with a fourth stride.
-        assert_eq!(classes(DetectorLayout::Ultralytics, [1, 5, 3598]), Some(1));
         assert_eq!(classes(DetectorLayout::NmsFree, [1, 300, 6]), None);
         assert_eq!(classes(DetectorLayout::NmsFree, [1, 0, 6]), None);
         assert_eq!(classes(DetectorLayout::Nanodet, [1, 3598, 112]), Some(80));
         assert_eq!(classes(DetectorLayout::Nanodet, [1, 3549, 33]), Some(1));
         let dynamic: &[Option<u32>] = &[None, Some(84), None];
-        assert_eq!(DetectorLayout::Ultralytics.check(&[dynamic], INPUT), Ok(None));
+        let none = ExportNote::default();
+        assert_eq!(DetectorLayout::Ultralytics.check(&[dynamic], INPUT, &none), Ok(None));
     }
 
     #[test]
@@ -317,12 +367,9 @@ mod tests {
              the model has [1, 2100, 85]"
         );
         assert_eq!(
-            refusal(
-                DetectorLayout::Ultralytics,
-                &[&shape(&[1, 116, 3549]), &shape(&[1, 32, 104, 104])]
-            ),
+            refusal(DetectorLayout::Ultralytics, &[&shape(&[1, 84, 3549]), &shape(&[1, 7])]),
             "layout `ultralytics` needs one output [1, 4 + classes, 3549], or transposed for an \
-             input of 416x416; the model has [1, 116, 3549], [1, 32, 104, 104]"
+             input of 416x416; the model has [1, 84, 3549], [1, 7]"
         );
         assert!(refusal(DetectorLayout::NmsFree, &[]).ends_with("the model has no output"));
         for layout in DetectorLayout::ALL {
@@ -337,13 +384,43 @@ mod tests {
                 &[2, 3549, 85],
                 &[1, 3549, 85, 1],
             ] {
-                if layout == DetectorLayout::Ultralytics && lengths == [1, u32::MAX, u32::MAX] {
-                    // A valid shape, but for the number of its values.
-                    continue;
-                }
                 let message = refusal(layout, &[&shape(lengths)]);
                 assert!(message.contains(&format!("{lengths:?}")), "{layout:?} {message}");
             }
+        }
+    }
+
+    #[test]
+    fn models_of_other_families_are_refused_by_name() {
+        let check = |layout: DetectorLayout, shapes: &[&[u32]], note: &[(&str, &str)]| {
+            let shapes: Vec<Vec<_>> =
+                shapes.iter().map(|shape| shape.iter().copied().map(Some).collect()).collect();
+            let shapes: Vec<_> = shapes.iter().map(Vec::as_slice).collect();
+            let note = ExportNote::of(note.iter().copied());
+            layout.check(&shapes, (640, 640), &note).map_err(|error| error.to_string())
+        };
+        let (ultralytics, nms_free) = (DetectorLayout::Ultralytics, DetectorLayout::NmsFree);
+        let head = [("task", "detect"), ("head", "RTDETRDecoder")];
+        for (layout, shapes, note, kind) in [
+            (ultralytics, &[&[1, 25200, 85][..]][..], &[][..], "YOLOv5 or YOLOv7"),
+            (ultralytics, &[&[1, 25_500, 85]], &[], "YOLOv5 or YOLOv7"),
+            (ultralytics, &[&[1, 300, 84]], &[], "RT-DETR"),
+            (nms_free, &[&[1, 300, 6]], &head, "RT-DETR"),
+            (ultralytics, &[&[1, 300, 84]], &head, "RT-DETR"),
+            (ultralytics, &[&[1, 56, 8400]], &[("task", "pose")], "for task `pose`"),
+            (ultralytics, &[&[1, 20, 8400]], &[("task", "obb")], "for task `obb`"),
+            (ultralytics, &[&[1, 116, 8400], &[1, 32, 160, 160]], &[], "a segmentation model"),
+        ] {
+            let message = check(layout, shapes, note).unwrap_err();
+            assert!(message.contains(kind) && message.contains("call `run`"), "{message}");
+        }
+        assert_eq!(check(ultralytics, &[&[1, 84, 8400]], &[("task", "detect")]), Ok(Some(80)));
+        assert_eq!(check(nms_free, &[&[1, 300, 6]], &[("end2end", "True")]), Ok(None));
+        // Grids with strides 4 to 32, and 8 to 64: 640x640 gives 34000 and 8500 cells.
+        for (anchors, stride) in [(34_000, "32"), (8500, "64")] {
+            let shape: &[&[u32]] = &[&[1, 84, anchors]];
+            assert_eq!(check(ultralytics, shape, &[("stride", stride)]), Ok(Some(80)));
+            assert!(check(ultralytics, shape, &[]).unwrap_err().contains("8400"));
         }
     }
 }

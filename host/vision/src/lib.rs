@@ -15,6 +15,7 @@
 mod bilinear;
 mod detect;
 mod error;
+mod export;
 mod heads;
 mod layout;
 mod placement;
@@ -22,6 +23,7 @@ mod prepare;
 
 pub use detect::{Detection, MAX_CANDIDATES, MAX_DETECTIONS, OutputView, Wanted, detect};
 pub use error::VisionError;
+pub use export::ExportNote;
 pub use layout::DetectorLayout;
 pub use placement::{Placed, Placement};
 pub use prepare::{MAX_TENSOR_SIDE, Preparer, Preprocess, prepare};

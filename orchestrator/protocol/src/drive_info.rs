@@ -36,6 +36,12 @@ pub struct DriveTopicInfo {
     pub messages: Option<u64>,
     /// True if the drive contains the definition of the type, or it is bundled.
     pub is_defined: bool,
+    /// Number of layouts by which the drive defines the type; 0 if it does not.
+    #[serde(default)]
+    pub layouts: u64,
+    /// Number of messages that were left out: they are no plain CDR, or have no possible time.
+    #[serde(default)]
+    pub malformed: u64,
     /// The reason why it cannot be read, if any.
     pub unreadable: Option<String>,
     /// Number of messages in the parts that were read.

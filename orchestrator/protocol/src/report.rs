@@ -1,5 +1,6 @@
 //! The reports of `gleaner-runtime` to its starter: progress, decisions, results.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
@@ -118,6 +119,10 @@ pub struct ReplaySummary {
     /// Number of messages after one with a later log time, as the index of a file is wrong or
     /// missing.
     pub out_of_order: u64,
+    /// Number of messages that were left out, by topic: they are no plain CDR, or have no possible
+    /// time.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub malformed: BTreeMap<String, u64>,
     /// Number of log lines of the lambda that were kept.
     pub log_lines: u64,
     /// Number of log lines over the rate limit, which were dropped.
@@ -229,6 +234,7 @@ mod tests {
             skipped: 0,
             missed_ticks: 0,
             out_of_order: 4,
+            malformed: BTreeMap::new(),
             log_lines: 3,
             log_dropped: 0,
             triggers_refused: 5,

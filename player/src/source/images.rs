@@ -1,6 +1,6 @@
 //! Converts compressed images into raw ones, and resizes them on request.
 
-use gleaner_image::{ImageError, decode_rgb8, probe};
+use gleaner_image::{ImageError, decode_rgb8, probe_message};
 use gleaner_messages::{
     CdrError, CompressedView, Definitions, Endian, FieldPath, HeaderStamp, MessageValue, Sources,
     header_stamp,
@@ -58,11 +58,11 @@ impl Decoder {
             MessageValue::Text(text) => text,
             _ => "",
         };
-        let header = probe(view.data)?;
+        let (header, file) = probe_message(view.format, view.data)?;
         // Too large an image is refused below, before memory is allocated.
         let len = header.rgb8_len().filter(|len| *len <= MAX_BYTES).unwrap_or(0);
         self.rgb.resize(len, 0);
-        decode_rgb8(view.data, &header, MAX_BYTES, &mut self.rgb)?;
+        decode_rgb8(file, &header, MAX_BYTES, &mut self.rgb)?;
         let from = Size { width: header.width, height: header.height };
         let to = self.size.unwrap_or(from);
         let head = cdr::image_head(stamp_ns, frame_id, to.width, to.height);

@@ -12,6 +12,8 @@ use gleaner_tests::{
 };
 use libtest_mimic::{Failed, Trial};
 
+use crate::cases;
+
 const TOPICS: [&str; 3] = ["/camera/front/compressed", "/imu/data", "/vehicle/speed"];
 
 pub fn trials() -> Vec<Trial> {
@@ -65,7 +67,7 @@ pub fn trials() -> Vec<Trial> {
 }
 
 /// The Python of `cargo xtask test`, if it has the readers.
-fn python() -> Result<PathBuf, String> {
+pub fn python() -> Result<PathBuf, String> {
     let python = root().join(".venv/bin/python3");
     let has = Command::new(&python).args(["-I", "-c", "import mcap, mcap_ros2, rosbags"]).output();
     if has.is_ok_and(|output| output.status.success()) {
@@ -94,7 +96,7 @@ fn seconds(run: &ReplayRun, at_ns: i64) -> f64 {
     (at_ns - start_ns) as f64 / 1e9
 }
 
-fn same<T: PartialEq + std::fmt::Debug>(found: &T, expected: &T) -> Result<(), Failed> {
+pub fn same<T: PartialEq + std::fmt::Debug>(found: &T, expected: &T) -> Result<(), Failed> {
     if found == expected {
         Ok(())
     } else {
@@ -406,6 +408,7 @@ fn reads(python: &Path, drive: &Path, args: &[&str]) -> Result<(), Failed> {
             return Err(String::from_utf8_lossy(&output.stderr).into_owned().into());
         }
         same(&String::from_utf8_lossy(&output.stdout).lines().count(), &3)?;
+        cases::same_values(python, drive, &out.path().join(&clip.file))?;
     }
     Ok(())
 }

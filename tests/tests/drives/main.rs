@@ -3,6 +3,7 @@
 //! Some drives, readers and file systems are not available everywhere; a test that needs one is
 //! ignored then, with that reason.
 
+mod cases;
 mod clips;
 mod crash;
 mod examples;
@@ -15,7 +16,8 @@ fn main() -> ExitCode {
     let of = |file: &'static str, trials: Vec<Trial>| {
         trials.into_iter().map(move |trial| trial.with_kind(file))
     };
-    let trials = of("clips", clips::trials())
+    let trials = of("cases", cases::trials())
+        .chain(of("clips", clips::trials()))
         .chain(of("crash", crash::trials()))
         .chain(of("examples", examples::trials()));
     libtest_mimic::run(&Arguments::from_args(), trials.collect()).exit_code()

@@ -61,6 +61,8 @@ impl FilledInputs {
                 seq,
                 endian: Endian::Little,
                 options: [0; 2],
+                layout: 0,
+                is_latched: false,
             };
             transport.publish(topic, &meta, cdr).expect("the sample fits");
         };

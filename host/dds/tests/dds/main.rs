@@ -8,6 +8,7 @@ mod discovery;
 mod first_sample;
 mod graph;
 mod hostile;
+mod layouts;
 mod life;
 mod network_namespace;
 mod peer;
@@ -45,6 +46,7 @@ fn main() -> ExitCode {
         discovery::TESTS,
         write::TESTS,
         hostile::TESTS,
+        layouts::TESTS,
         life::TESTS,
         unsubscribe::TESTS,
         first_sample::TESTS,

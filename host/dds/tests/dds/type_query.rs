@@ -32,6 +32,7 @@ pub const TESTS: &[Test] = &[
     ("an_answer_with_another_hash_than_announced_is_rejected", wrong_hash),
     ("a_type_without_a_hash_is_not_queried", no_hash),
     ("a_node_without_the_service_gets_no_further_query", no_service),
+    ("a_definition_at_hand_of_another_layout_gives_way_to_that_of_the_node", stale),
     ("a_type_without_a_writer_is_queried_once_it_has_one", late_writer),
 ];
 
@@ -406,6 +407,27 @@ fn no_service() {
     let car = Car::join(domain, None);
     car.announce_hashes(&dds, domain);
     assert!(!wait(&dds, "/wheel"));
+}
+
+fn stale() {
+    let folder = std::env::temp_dir().join(format!("gleaner-stale-{}", std::process::id()));
+    std::fs::create_dir_all(&folder).unwrap();
+    std::fs::write(folder.join("Tyre.msg"), "float64 bar\nfloat64 temperature\n").unwrap();
+    let answers: [Respond; 2] = [honest, |_| Response::default()];
+    for (respond, of_node) in answers.into_iter().zip([Some("float64 bar\n"), None]) {
+        let domain = domain();
+        let messages = vec![folder.clone()];
+        let dds = Dds::open(DdsOptions { largest: 0, messages, ..options(domain) }).unwrap();
+        let car = Car::join(domain, Some((ServiceMapping::Enhanced, respond)));
+        wait_for_both(&dds);
+        let at_hand = text(&dds, "/tyre").expect("no hash is announced");
+        assert!(at_hand.ends_with("temperature\n"), "{at_hand}");
+        car.announce_hashes(&dds, domain);
+        assert_eq!((text(&dds, "/tyre"), dds.type_hash("/tyre").as_deref()), (None, Some(TYRE)));
+        assert_eq!(wait(&dds, "/tyre"), of_node.is_some());
+        assert_eq!(text(&dds, "/tyre").as_deref(), of_node);
+    }
+    std::fs::remove_dir_all(&folder).unwrap();
 }
 
 fn late_writer() {

@@ -133,6 +133,13 @@ impl Transport for DrivePlayer {
             return Err(TransportError::AlreadyStarted { topic: spec.topic.clone() });
         }
         let route = self.route(&spec.topic, &type_name);
+        if !same_type(route.type_name(), &type_name) {
+            return Err(TransportError::WrongType {
+                topic: spec.topic.clone(),
+                wanted: type_name,
+                found: route.type_name().to_owned(),
+            });
+        }
         let subscription = Subscription(self.subscriptions.len());
         route.add(subscription, spec.max_bytes, sink);
         self.subscriptions.push(Some(route));
@@ -140,7 +147,8 @@ impl Transport for DrivePlayer {
     }
 
     fn definitions(&self, topic: &str) -> Result<Arc<Definitions>, TransportError> {
-        self.catalog.definitions(topic)
+        let routes = self.routes.lock().unwrap_or_else(PoisonError::into_inner);
+        self.catalog.definitions(topic, routes.get(topic).map(|route| route.type_name()))
     }
 }
 

@@ -98,6 +98,8 @@ impl Publisher for LoopedPublisher {
             seq,
             endian: Endian::Little,
             options: [0; 2],
+            layout: 0,
+            is_latched: false,
         };
         self.route.deliver(&meta, cdr);
         Ok(())

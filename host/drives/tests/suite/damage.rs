@@ -168,27 +168,36 @@ fn fewer_messages_than_the_summary_counts_are_noticed_at_the_end() {
 }
 
 #[test]
-fn messages_that_are_not_cdr_end_the_drive_at_their_position() {
+fn messages_that_are_not_cdr_are_left_out_and_counted() {
     use std::collections::BTreeMap;
     use std::io::Cursor;
-    for bad in [&[0u8, 7, 0, 0, 1][..], &[0, 1, 0], &[]] {
+    // No bytes, a list of parameters, XCDR2 plain and delimited.
+    for bad in [&[][..], &[0, 1, 0], &[0, 3, 0, 0, 1], &[0, 7, 0, 0, 1], &[0, 9, 0, 0, 1]] {
         let mut writer = small_chunks().create(Cursor::new(Vec::new())).unwrap();
         let schema = writer.add_schema(crate::support::TYPE, "ros2msg", b"int64 value").unwrap();
         let channel_id = writer.add_channel(schema, "/a", "cdr", &BTreeMap::new()).unwrap();
-        for message in ticking(&["/a"], 5, 10) {
-            crate::support::write(&mut writer, channel_id, &message);
+        for (n, message) in ticking(&["/a"], 6, 10).iter().enumerate() {
+            if n == 3 {
+                let header = mcap::records::MessageHeader {
+                    channel_id,
+                    sequence: 0,
+                    log_time: 35,
+                    publish_time: 0,
+                };
+                writer.write_to_known_channel(&header, bad).unwrap();
+            }
+            crate::support::write(&mut writer, channel_id, message);
         }
-        let header = mcap::records::MessageHeader {
-            channel_id,
-            sequence: 0,
-            log_time: 1000,
-            publish_time: 0,
-        };
-        writer.write_to_known_channel(&header, bad).unwrap();
         writer.finish().unwrap();
-        let (all, error) = replayed(&[file(&writer.into_inner().into_inner())], &["/a"]);
-        assert_eq!(all.len(), 5);
-        assert!(matches!(damage(error).1, Damage::Encapsulation { .. }));
+        let mut replay = Replay::open(&[file(&writer.into_inner().into_inner())]).unwrap();
+        let memory = listen(&mut replay, &["/a"]);
+        let (steps, error) = run(&mut replay);
+        assert!(error.is_none(), "{error:?}");
+        assert!(memory.values().iter().map(|(_, value)| *value).eq(0..6));
+        // Time passes with it, as for every other message.
+        assert!(steps.len() == 7 && steps[3].at_ns == 35);
+        assert_eq!(steps[3].delivery, gleaner_transport::Delivery::Malformed);
+        assert_eq!(replay.malformed()["/a"], 1);
     }
 }
 

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::io::Cursor;
 use std::sync::Arc;
 
-use gleaner_drives::{DriveLimits, Progress, Replay, ReplayError};
+use gleaner_drives::{DriveLimits, DriveOptions, Progress, Replay, ReplayError};
 use gleaner_messages::{CompressedView, Endian, FieldPath, header_stamp};
 use gleaner_transport::{Subscription, TopicSpec, Transport, TransportError};
 use mcap::records::MessageHeader;
@@ -283,17 +283,103 @@ fn errors_name_the_topic_and_the_alternatives() {
 }
 
 #[test]
-fn files_that_disagree_on_a_type_are_refused() {
+fn each_type_of_a_topic_is_read_alone() {
     let good = drive(small_chunks(), &ticking(&["/a"], 10, 100));
     let mut writer = small_chunks().create(Cursor::new(Vec::new())).unwrap();
     let schema = writer.add_schema("test_msgs/msg/Other", "ros2msg", b"int8 x").unwrap();
-    writer.add_channel(schema, "/a", "cdr", &BTreeMap::new()).unwrap();
+    let channel_id = writer.add_channel(schema, "/a", "cdr", &BTreeMap::new()).unwrap();
+    let header = MessageHeader { channel_id, sequence: 1, log_time: 105, publish_time: 0 };
+    writer.write_to_known_channel(&header, &[0, 1, 0, 0, 77]).unwrap();
     writer.finish().unwrap();
-    let other = writer.into_inner().into_inner();
-    let refused = Replay::open(&[file(&good), file(&other)]).err().unwrap();
-    let text = refused.to_string();
-    assert!(matches!(refused, ReplayError::TypeConflict { .. }));
-    assert!(text.contains(TYPE) && text.contains("test_msgs/msg/Other"), "{text}");
+    let both = [file(&writer.into_inner().into_inner()), file(&good)];
+    let mut replay = Replay::open(&both).unwrap();
+    let topics = replay.topics();
+    // That with the most messages comes first.
+    let found: Vec<_> = topics.iter().map(|topic| (&*topic.type_name, topic.messages)).collect();
+    assert_eq!(found, [(TYPE, Some(10)), ("test_msgs/msg/Other", Some(1))]);
+    let (number, other) = (listen(&mut replay, &["/a"]), Arc::new(MemorySink::default()));
+    let spec = TopicSpec { type_name: "test_msgs/msg/Other".to_owned(), ..spec("/a") };
+    replay.subscribe(&spec, other.clone()).unwrap();
+    assert!(run(&mut replay).1.is_none());
+    assert_eq!(number.values().len(), 10);
+    assert_eq!(other.0.lock().unwrap().iter().map(|(_, cdr)| cdr[0]).collect::<Vec<_>>(), [77]);
+    let absent = TopicSpec { type_name: "test_msgs/msg/Third".to_owned(), ..spec };
+    let refused = Replay::open(&both).unwrap().can_subscribe(&absent).unwrap_err();
+    assert!(matches!(refused, TransportError::WrongType { found, .. } if found == TYPE));
+}
+
+/// Creates a drive with one channel of `/a` for each definition, which has one message of two bytes
+/// `n` and `10 + n`.
+fn drive_of_layouts(definitions: &[&str]) -> std::path::PathBuf {
+    let mut writer = small_chunks().create(Cursor::new(Vec::new())).unwrap();
+    for (n, text) in definitions.iter().enumerate() {
+        let schema = writer.add_schema(TYPE, "ros2msg", text.as_bytes()).unwrap();
+        let metadata = [("n".to_owned(), n.to_string())].into();
+        let channel_id = writer.add_channel(schema, "/a", "cdr", &metadata).unwrap();
+        let n = n as u8;
+        let log_time = 100 + u64::from(n);
+        let header = MessageHeader { channel_id, sequence: 1, log_time, publish_time: 0 };
+        writer.write_to_known_channel(&header, &[0, 1, 0, 0, n, 10 + n]).unwrap();
+    }
+    writer.finish().unwrap();
+    file(&writer.into_inner().into_inner())
+}
+
+#[test]
+fn each_message_is_read_by_the_layout_of_its_channel() {
+    let one = drive_of_layouts(&[
+        "uint8 x\nuint8 y\n",
+        "uint8 y\nuint8 x\n",
+        "# other\nuint8 x\nuint8 y\n",
+    ]);
+    let two = [
+        drive_of_layouts(&["uint8 x\nuint8 y\n"]),
+        drive_of_layouts(&["uint8 X=5\nuint8 x 7\nuint8 y\n", "uint8 y\nuint8 x\n"]),
+    ];
+    for (paths, layouts, x) in
+        [(&[one][..], vec![0, 1, 0], [0.0, 11.0, 2.0]), (&two, vec![0, 0, 1], [0.0, 0.0, 11.0])]
+    {
+        let mut replay = Replay::open(paths).unwrap();
+        let memory = listen(&mut replay, &["/a"]);
+        assert!(run(&mut replay).1.is_none());
+        let path = FieldPath::compile(&replay.definitions("/a").unwrap(), "x").unwrap();
+        let taken = memory.0.lock().unwrap();
+        assert!(taken.iter().map(|(meta, _)| meta.layout).eq(layouts));
+        let read = taken.iter().map(|(meta, cdr)| {
+            path.in_layout(meta.layout).unwrap().number(cdr, meta.endian).unwrap()
+        });
+        assert!(read.eq(x));
+        assert_eq!(replay.topics()[0].other_definitions.len(), 1);
+    }
+}
+
+#[test]
+fn a_path_that_differs_between_layouts_is_refused_with_both() {
+    let drive =
+        drive_of_layouts(&["uint8 x\nuint8 y\n", "uint8 y\nstring x\n", "uint8 y\nuint8 z\n"]);
+    let definitions = Replay::open(&[drive]).unwrap().definitions("/a").unwrap();
+    let refused = |path| FieldPath::compile(&definitions, path).unwrap_err().to_string();
+    assert_eq!(
+        refused("x"),
+        "`x` does not mean the same in all layouts of `test_msgs/msg/Number` on this topic: in \
+         that with the fields `x`, `y`, it is an integer; in that with the fields `y`, `x`, it is \
+         a string"
+    );
+    let z = refused("z");
+    assert!(z.contains("has no field `z`") && z.contains("`y`, `z`, it is an integer"), "{z}");
+    // A path that no layout has is refused as with one layout.
+    assert!(refused("w").starts_with("type `test_msgs/msg/Number` has no field `w`"));
+    FieldPath::compile(&definitions, "y").unwrap();
+}
+
+#[test]
+fn messages_without_a_known_layout_are_refused_if_there_are_several() {
+    let several = ["uint8 x\n", "uint16 x\n", ""];
+    for (texts, is_known) in [(&several[..], false), (&several[..2], true), (&several[1..], true)] {
+        let replay = Replay::open(&[drive_of_layouts(texts)]).unwrap();
+        let found = replay.can_subscribe(&spec("/a"));
+        assert_eq!(found.is_ok(), is_known, "{texts:?}: {found:?}");
+    }
 }
 
 #[test]
@@ -301,7 +387,8 @@ fn a_file_that_is_not_a_drive_is_refused_on_open() {
     let refuse = |path| Replay::open(&[path]).err().unwrap();
     assert!(matches!(Replay::open(&[]).err().unwrap(), ReplayError::NoFiles));
     assert!(matches!(refuse("no/such/file".into()), ReplayError::Open { .. }));
-    assert!(matches!(refuse(file(b"")), ReplayError::NotMcap { .. }));
+    assert!(matches!(refuse(file(b"no drive")), ReplayError::NotMcap { .. }));
+    assert!(matches!(refuse(file(b"")), ReplayError::Empty { .. }));
     // With and without the feature `bags`.
     let database = refuse(file(b"SQLite format 3\0"));
     assert!(
@@ -319,4 +406,32 @@ fn a_file_that_is_not_a_drive_is_refused_on_open() {
 fn a_replay_can_move_to_another_thread() {
     fn is_send<T: Send>() {}
     is_send::<Replay>();
+}
+
+#[test]
+fn recordings_of_one_topic_that_overlap_are_refused_without_merge() {
+    const SECOND: u64 = 1_000_000_000;
+    let from = |topic, first| {
+        let mut messages = ticking(&[topic], 2, 0);
+        messages[0].at = first;
+        messages[1].at = first + 10 * SECOND;
+        file(&drive(small_chunks(), &messages))
+    };
+    let earlier = from("/a", SECOND);
+    let open = |other: &std::path::Path, merge| {
+        let options = DriveOptions { merge, ..DriveOptions::default() };
+        Replay::open_as(&[earlier.clone(), other.to_owned()], &options).map(drop)
+    };
+    // A recorder that goes on in another file writes some messages late.
+    for (topic, first, is_refused) in
+        [("/a", 3, true), ("/b", 3, false), ("/a", 10, false), ("/a", 12, false)]
+    {
+        let other = from(topic, first * SECOND);
+        let refused = open(&other, false).err();
+        assert_eq!(refused.is_some(), is_refused, "{topic} {first}: {refused:?}");
+        open(&other, true).unwrap();
+    }
+    let error = open(&from("/a", SECOND), false).unwrap_err();
+    assert!(error.to_string().ends_with("overlap in time, and both have topic `/a`"), "{error}");
+    assert!(error.help().unwrap().contains("--merge"));
 }

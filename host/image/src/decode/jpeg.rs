@@ -13,7 +13,7 @@
 
 use std::cell::Cell;
 
-use gleaner_rules::pixels::{PixelError, StopCheck, check_size};
+use gleaner_rules::pixels::{Encoding, PixelError, StopCheck, check_size};
 use zune_core::colorspace::ColorSpace;
 use zune_core::options::DecoderOptions;
 use zune_jpeg::JpegDecoder;
@@ -24,6 +24,10 @@ use crate::error::ImageError;
 
 /// Start of image, and the start of the marker that must follow.
 pub(super) const MAGIC: [u8; 3] = [0xff, 0xd8, 0xff];
+
+/// A segment of frames in AVI files, for which `zune-jpeg` uses the Huffman tables of ITU-T T.81,
+/// annex K.3. Cameras that send MJPEG leave these tables out, with or without this segment.
+const STANDARD_TABLES: &[u8] = b"\xff\xe0\0\x07AVI1\0";
 
 /// Maximum number of scans of a progressive image. Encoders write about ten.
 const MAX_SCANS: usize = 64;
@@ -42,16 +46,23 @@ pub(super) fn decode(
     out: &mut [u8],
     pace: &StopCheck<'_>,
 ) -> Result<(), ImageError> {
-    let &ImageHeader { format, width, height } = header;
-    let needed = frame(data)?.working_memory();
+    let &ImageHeader { format, width, height, .. } = header;
+    let frame = frame(data)?;
+    let needed = frame.working_memory();
     if needed > allowed as u64 {
         return Err(ImageError::WorkingMemory { format, width, height, needed, allowed });
     }
-    check_structure(data)?;
+    let completed;
+    let data = if check_structure(data)? || frame.progressive {
+        data
+    } else {
+        completed = [&data[..2], STANDARD_TABLES, &data[2..]].concat();
+        &completed
+    };
     let stopped = Cell::new(false);
-    let refused = |source| match stopped.get() {
+    let refused = |cause| match stopped.get() {
         true => PixelError::Stopped.into(),
-        false => ImageError::Jpeg { width, height, source },
+        false => ImageError::Jpeg { width, height, cause },
     };
     let options = DecoderOptions::default()
         .set_strict_mode(true)
@@ -86,7 +97,8 @@ struct FrameHeader {
 
 impl FrameHeader {
     fn header(&self) -> ImageHeader {
-        ImageHeader { format: Format::Jpeg, width: self.width, height: self.height }
+        let (width, height) = (self.width, self.height);
+        ImageHeader { format: Format::Jpeg, width, height, encoding: Encoding::Rgb8 }
     }
 
     /// Returns the maximum that `zune-jpeg` 0.5 allocates, in bytes: two for each coefficient of a
@@ -163,11 +175,13 @@ fn frame_of(segment: &JpegSegment<'_>) -> Result<FrameHeader, ImageError> {
     Ok(FrameHeader { width, height, progressive: segment.marker == 0xc2, components, sampling })
 }
 
-/// Checks all of `data`: one frame header, then its scans, then the end.
-fn check_structure(data: &[u8]) -> Result<(), ImageError> {
+/// Checks all of `data`: one frame header, then its scans, then the end. Returns whether it has
+/// Huffman tables.
+fn check_structure(data: &[u8]) -> Result<bool, ImageError> {
     let mut segments = JpegSegments::of(data);
     let mut frame: Option<FrameHeader> = None;
     let mut scans = 0;
+    let mut has_tables = false;
     loop {
         let segment = segments.next()?;
         let at = segment.at;
@@ -187,12 +201,14 @@ fn check_structure(data: &[u8]) -> Result<(), ImageError> {
                 }
             }
             (END, _) if scans == 0 => return Err(damaged(at, "an end before any pixels")),
-            (END, _) => return Ok(()),
+            (END, _) => return Ok(has_tables),
+            (TABLES, _) => has_tables = true,
             (marker, _) => supported(marker)?,
         }
     }
 }
 
+const TABLES: u8 = 0xc4;
 const SCAN: u8 = 0xda;
 const END: u8 = 0xd9;
 

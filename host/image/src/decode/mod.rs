@@ -1,13 +1,14 @@
-//! Decodes JPEG and PNG bytes to rgb8.
+//! Decodes JPEG and PNG bytes to rgb8, or to mono16.
 //!
 //! [`probe`] finds the format and the size that the header claims, from the first bytes alone;
-//! [`decode_rgb8`] decodes into memory of the caller. `zune-jpeg` and `png` decode the pixels; this
+//! [`decode`] decodes into memory of the caller. `zune-jpeg` and `png` decode the pixels; this
 //! module adds a cost that is known in advance.
 //!
 //! Nothing is allocated before the size is compared with the caller's limit, a truncated file never
 //! passes as a whole image, and no pixels of an earlier image stay in the output.
 
 mod jpeg;
+mod message;
 mod paced;
 mod png;
 #[cfg(test)]
@@ -17,7 +18,9 @@ mod tests;
 
 use std::fmt;
 
-use super::{ImageError, PixelError, StopCheck};
+pub use message::probe_message;
+
+use super::{Encoding, ImageError, PixelError, StopCheck};
 
 /// Format of an image file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -46,6 +49,8 @@ pub struct ImageHeader {
     pub width: u32,
     /// Rows, 1 to [`MAX_SIDE`](super::MAX_SIDE).
     pub height: u32,
+    /// Layout of the decoded pixels: rgb8, or mono16 for a grey PNG of 16 bits.
+    pub encoding: Encoding,
 }
 
 impl ImageHeader {
@@ -55,6 +60,11 @@ impl ImageHeader {
             .ok()?
             .checked_mul(usize::try_from(self.height).ok()?)?
             .checked_mul(3)
+    }
+
+    /// Returns the bytes of the decoded image, as [`rgb8_len`](Self::rgb8_len).
+    pub fn decoded_len(&self) -> Option<usize> {
+        self.rgb8_len().map(|len| len / 3 * self.encoding.bytes_per_pixel())
     }
 }
 
@@ -69,7 +79,7 @@ impl fmt::Display for ImageHeader {
 /// # Errors
 ///
 /// [`ImageError::NotAnImage`] for other bytes, [`PixelError::Size`] for an image without pixels,
-/// [`ImageError::Unsupported`] for a kind of JPEG that cameras do not send, and
+/// [`ImageError::Unsupported`] for a kind of JPEG or PNG that is not decoded, and
 /// [`ImageError::Truncated`] or [`ImageError::Damaged`] if there is no readable header.
 pub fn probe(data: &[u8]) -> Result<ImageHeader, ImageError> {
     match format_of(data)? {
@@ -79,12 +89,13 @@ pub fn probe(data: &[u8]) -> Result<ImageHeader, ImageError> {
 }
 
 /// Decodes `data`, whose header [`probe`] returned, into `out`: rows from the top, without padding,
-/// [`ImageHeader::rgb8_len`] bytes. Grey becomes equal red, green and blue; alpha is dropped; 16
-/// bit values keep their high byte.
+/// [`ImageHeader::decoded_len`] bytes of the header's encoding. Grey of 8 bits becomes equal red,
+/// green and blue; alpha is dropped; values of 16 bits are little-endian. The caller may stop it by
+/// `pace`, but not in the last step of a progressive JPEG, from coefficients to pixels.
 ///
 /// `max_bytes` is the limit for an image of this input as rgb8, its `decoded_size`. It also bounds
-/// the allocations of the decoder: 4 MiB plus four times `max_bytes`, and copies of the file's own
-/// metadata.
+/// the allocations of the decoder: 4 MiB plus four times `max_bytes`, copies of the file's own
+/// metadata, and one of a JPEG without Huffman tables.
 ///
 /// A JPEG has no checksum: changed bytes can decode to a wrong picture. So can a file whose camera
 /// wrote the end too early: the rest is then made up. A PNG whose pixels were changed is refused.
@@ -96,23 +107,9 @@ pub fn probe(data: &[u8]) -> Result<ImageHeader, ImageError> {
 /// [`ImageError::WorkingMemory`] if the decoder would need too much; [`PixelError::Output`] if
 /// `out` has another length; [`ImageError::OtherImage`] if `header` is not that of `data`;
 /// [`ImageError::Truncated`], [`ImageError::Damaged`], [`ImageError::Unsupported`],
-/// [`ImageError::Jpeg`] or [`ImageError::Png`] if the file is broken or unsupported.
-pub fn decode_rgb8(
-    data: &[u8],
-    header: &ImageHeader,
-    max_bytes: usize,
-    out: &mut [u8],
-) -> Result<(), ImageError> {
-    decode_rgb8_paced(data, header, max_bytes, out, &StopCheck::new(&|| true))
-}
-
-/// As [`decode_rgb8`], for a caller that may want to stop it. The last step of a progressive JPEG,
-/// from coefficients to pixels, cannot be stopped.
-///
-/// # Errors
-///
-/// As [`decode_rgb8`], and [`PixelError::Stopped`].
-pub fn decode_rgb8_paced(
+/// [`ImageError::Jpeg`] or [`ImageError::Png`] if the file is broken or unsupported;
+/// [`PixelError::Stopped`].
+pub fn decode(
     data: &[u8],
     header: &ImageHeader,
     max_bytes: usize,
@@ -123,9 +120,9 @@ pub fn decode_rgb8_paced(
     if found != *header {
         return Err(ImageError::OtherImage { expected: *header, found });
     }
-    let ImageHeader { format, width, height } = found;
-    let needed = match found.rgb8_len() {
-        Some(needed) if needed <= max_bytes => needed,
+    let ImageHeader { format, width, height, .. } = found;
+    let needed = match (found.rgb8_len(), found.decoded_len()) {
+        (Some(limited), Some(needed)) if limited <= max_bytes => needed,
         _ => {
             let needed = 3 * u64::from(width) * u64::from(height);
             return Err(ImageError::Bomb { width, height, needed, allowed: max_bytes });
@@ -141,6 +138,24 @@ pub fn decode_rgb8_paced(
         Format::Jpeg => jpeg::decode(data, &found, allowed, out, pace),
         Format::Png => png::decode(data, &found, allowed, out, pace),
     }
+}
+
+/// As [`decode`], for callers that need 8 bits per value and do not stop it.
+///
+/// # Errors
+///
+/// As [`decode`], and [`ImageError::Unsupported`] for an image of 16 bits.
+pub fn decode_rgb8(
+    data: &[u8],
+    header: &ImageHeader,
+    max_bytes: usize,
+    out: &mut [u8],
+) -> Result<(), ImageError> {
+    if header.encoding != Encoding::Rgb8 {
+        let what = "of 16 bits per value where 8 are needed";
+        return Err(ImageError::Unsupported { format: header.format, what });
+    }
+    decode(data, header, max_bytes, out, &StopCheck::new(&|| true))
 }
 
 /// Returns the format of `data` by its magic bytes.

@@ -1,9 +1,9 @@
-//! Decodes PNG: the crate `png` returns rows one by one, which become rgb8.
+//! Decodes PNG: the crate `png` returns rows one by one, which become rgb8 or mono16.
 
 use std::io::{Cursor, ErrorKind};
 
-use gleaner_rules::pixels::{StopCheck, check_size};
-use png::{ColorType, Decoder, DecodingError, InterlaceInfo, Limits, Transformations};
+use gleaner_rules::pixels::{Encoding, StopCheck, check_size};
+use png::{BitDepth, ColorType, Decoder, DecodingError, InterlaceInfo, Limits, Transformations};
 
 use super::{Format, ImageHeader};
 use crate::error::ImageError;
@@ -11,20 +11,32 @@ use crate::error::ImageError;
 /// Signature of PNG.
 pub(super) const MAGIC: [u8; 8] = *b"\x89PNG\r\n\x1a\n";
 
+/// Colour type of grey pixels without alpha, in the header.
+const GREY: u8 = 0;
+
 /// Returns the header of `data`, which starts with [`MAGIC`].
 pub(super) fn header(data: &[u8]) -> Result<ImageHeader, ImageError> {
-    let Some((chunk, _)) = data.get(MAGIC.len()..).and_then(|rest| rest.split_first_chunk::<16>())
+    let Some((chunk, _)) = data.get(MAGIC.len()..).and_then(|rest| rest.split_first_chunk::<18>())
     else {
         return Err(truncated(data));
     };
-    let [start @ .., w3, w2, w1, w0, h3, h2, h1, h0] = chunk;
+    let [start @ .., w3, w2, w1, w0, h3, h2, h1, h0, depth, color] = chunk;
     if start != b"\0\0\0\x0dIHDR" {
         return Err(damaged(MAGIC.len(), "no header where one is required"));
     }
     let width = u32::from_be_bytes([*w3, *w2, *w1, *w0]);
     let height = u32::from_be_bytes([*h3, *h2, *h1, *h0]);
     check_size(width, height)?;
-    Ok(ImageHeader { format: Format::Png, width, height })
+    let format = Format::Png;
+    let encoding = match (*depth, *color) {
+        (16, GREY) => Encoding::Mono16,
+        (16, _) => {
+            let what = "of 16 bits per value with colour or alpha";
+            return Err(ImageError::Unsupported { format, what });
+        }
+        _ => Encoding::Rgb8,
+    };
+    Ok(ImageHeader { format, width, height, encoding })
 }
 
 /// Decodes `data` into `out`, which has the length that `header` requires, with at most `allowed`
@@ -37,28 +49,31 @@ pub(super) fn decode(
     out: &mut [u8],
     pace: &StopCheck<'_>,
 ) -> Result<(), ImageError> {
-    let &ImageHeader { width, height, .. } = header;
-    let refused = |source| match source {
+    let &ImageHeader { width, height, encoding, .. } = header;
+    let refused = |cause| match cause {
         DecodingError::IoError(error) if error.kind() == ErrorKind::UnexpectedEof => {
             truncated(data)
         }
-        source => ImageError::Png { width, height, source },
+        cause => ImageError::Png { width, height, cause },
     };
     let mut decoder = Decoder::new_with_limits(Cursor::new(data), Limits { bytes: allowed });
-    // 8 bits per value, and colours instead of palette indices.
-    decoder.set_transformations(Transformations::normalize_to_color8());
+    if encoding == Encoding::Rgb8 {
+        // 8 bits per value, and colours instead of palette indices.
+        decoder.set_transformations(Transformations::normalize_to_color8());
+    }
     decoder.set_ignore_text_chunk(true);
     decoder.set_ignore_iccp_chunk(true);
     let mut reader = decoder.read_info().map_err(refused)?;
-    let (color, _) = reader.output_color_type();
-    let stride = 3 * width as usize;
+    let color = reader.output_color_type();
+    let pixel = encoding.bytes_per_pixel();
+    let stride = pixel * width as usize;
     // Both parsers must read the same header.
     let len = match reader.output_line_size(width) {
         Some(len) if reader.info().size() == (width, height) => len,
         _ => return Err(damaged(MAGIC.len(), "its header is ambiguous")),
     };
     let mut line = vec![0; len];
-    let mut rgb = vec![0; stride];
+    let mut pixels = vec![0; stride];
     let mut rows = 0;
     while let Some(interlace) = reader.read_row(&mut line).map_err(refused)? {
         // Inflating takes several times as long as other work on as many bytes.
@@ -68,12 +83,12 @@ pub(super) fn decode(
                 let Some(row) = out.chunks_exact_mut(stride).nth(rows) else {
                     break;
                 };
-                to_rgb(color, &line, row);
+                convert(color, &line, row);
                 rows += 1;
             }
             InterlaceInfo::Adam7(pass) => {
-                to_rgb(color, &line, &mut rgb);
-                png::expand_interlaced_row(out, stride, &rgb, &pass, 24);
+                convert(color, &line, &mut pixels);
+                png::expand_interlaced_row(out, stride, &pixels, &pass, 8 * pixel as u8);
             }
         }
     }
@@ -81,24 +96,27 @@ pub(super) fn decode(
     reader.finish().map_err(refused)
 }
 
-/// Converts the pixels of `line`, with 8 bits per value, to `rgb`.
-fn to_rgb(color: ColorType, line: &[u8], rgb: &mut [u8]) {
+/// Converts the pixels of `line` to rgb8, or those of 16 bits, which are grey, to little-endian.
+fn convert((color, depth): (ColorType, BitDepth), line: &[u8], out: &mut [u8]) {
+    if depth == BitDepth::Sixteen {
+        return each::<2, 2>(line, out, |pixel| [pixel[1], pixel[0]]);
+    }
     match color {
-        ColorType::Grayscale => spread::<1>(line, rgb, |pixel| [pixel[0]; 3]),
-        ColorType::GrayscaleAlpha => spread::<2>(line, rgb, |pixel| [pixel[0]; 3]),
-        ColorType::Rgb | ColorType::Indexed => spread::<3>(line, rgb, |pixel| *pixel),
-        ColorType::Rgba => spread::<4>(line, rgb, |pixel| [pixel[0], pixel[1], pixel[2]]),
+        ColorType::Grayscale => each::<1, 3>(line, out, |pixel| [pixel[0]; 3]),
+        ColorType::GrayscaleAlpha => each::<2, 3>(line, out, |pixel| [pixel[0]; 3]),
+        ColorType::Rgb | ColorType::Indexed => each::<3, 3>(line, out, |pixel| *pixel),
+        ColorType::Rgba => each::<4, 3>(line, out, |pixel| [pixel[0], pixel[1], pixel[2]]),
     }
 }
 
-/// Converts each pixel of `BYTES` bytes by `colour`.
-fn spread<const BYTES: usize>(
+/// Converts each pixel of `FROM` bytes to one of `TO` bytes.
+fn each<const FROM: usize, const TO: usize>(
     line: &[u8],
-    rgb: &mut [u8],
-    colour: impl Fn(&[u8; BYTES]) -> [u8; 3],
+    out: &mut [u8],
+    converted: impl Fn(&[u8; FROM]) -> [u8; TO],
 ) {
-    for (rgb, pixel) in rgb.as_chunks_mut::<3>().0.iter_mut().zip(line.as_chunks::<BYTES>().0) {
-        *rgb = colour(pixel);
+    for (out, pixel) in out.as_chunks_mut::<TO>().0.iter_mut().zip(line.as_chunks::<FROM>().0) {
+        *out = converted(pixel);
     }
 }
 
@@ -118,7 +136,7 @@ mod tests {
 
     use super::*;
     use crate::decode::samples::{self, HEIGHT, WIDTH, colour};
-    use crate::decode::tests::{assert_close, decoded};
+    use crate::decode::tests::{NOT_SUPPORTED, assert_close, decoded, rgb8_header};
     use crate::decode::{decode_rgb8, probe};
 
     /// Encodes a PNG of `WIDTH` x `HEIGHT` pixels.
@@ -147,13 +165,13 @@ mod tests {
     }
 
     #[test]
-    fn a_png_of_any_kind_becomes_rgb8() {
-        use BitDepth::{Eight, Four, One, Sixteen};
+    fn a_png_of_any_kind_of_8_bits_becomes_rgb8() {
+        use BitDepth::{Eight, Four, One};
         let full = |value: u8| [value, 0x55];
         let red = |x, y| colour(x, y)[0];
         let grey = |x, y| [red(x, y); 3];
         type Expected<'a> = &'a dyn Fn(usize, usize) -> [u8; 3];
-        let cases: [(ColorType, BitDepth, Vec<u8>, Expected<'_>); 8] = [
+        let cases: [(ColorType, BitDepth, Vec<u8>, Expected<'_>); 6] = [
             (ColorType::Rgb, Eight, pixels(colour), &colour),
             (
                 ColorType::Rgba,
@@ -164,17 +182,7 @@ mod tests {
                 }),
                 &colour,
             ),
-            (
-                ColorType::Rgb,
-                Sixteen,
-                pixels(|x, y| {
-                    let [r, g, b] = colour(x, y);
-                    [r, 1, g, 2, b, 0xff]
-                }),
-                &colour,
-            ),
             (ColorType::Grayscale, Eight, pixels(|x, y| [red(x, y)]), &grey),
-            (ColorType::Grayscale, Sixteen, pixels(|x, y| full(red(x, y))), &grey),
             (ColorType::GrayscaleAlpha, Eight, pixels(|x, y| full(red(x, y))), &grey),
             // 0101… and 0 to 15, 0 to 15: eight and two pixels per byte.
             (ColorType::Grayscale, One, vec![0x55; 48], &|x, _| [(x % 2 * 255) as u8; 3]),
@@ -184,9 +192,29 @@ mod tests {
         ];
         for (color, depth, data, expected) in cases {
             let file = png(color, depth, None, &data);
-            let header = ImageHeader { format: Format::Png, width: WIDTH, height: HEIGHT };
-            assert_eq!(probe(&file).unwrap(), header);
+            assert_eq!(probe(&file).unwrap(), rgb8_header(Format::Png));
             assert_close(&decoded(&file).unwrap(), 0, expected);
+        }
+    }
+
+    #[test]
+    fn a_grey_png_of_16_bits_keeps_them_and_others_are_refused() {
+        for file in [samples::DEPTH, samples::DEPTH_INTERLACED] {
+            let header = probe(file).unwrap();
+            assert_eq!((header.encoding, header.decoded_len()), (Encoding::Mono16, Some(16)));
+            let values = samples::DEPTH_VALUES.map(u16::to_le_bytes).concat();
+            assert_eq!(decoded(file).unwrap(), values);
+            let error = decode_rgb8(file, &header, 24, &mut [0; 24]).unwrap_err().to_string();
+            assert!(error.contains("of 16 bits per value where 8 are needed"), "{error}");
+        }
+        for (color, bytes) in
+            [(ColorType::Rgb, 6), (ColorType::Rgba, 8), (ColorType::GrayscaleAlpha, 4)]
+        {
+            let data = vec![7; bytes * (WIDTH * HEIGHT) as usize];
+            assert_eq!(
+                probe(&png(color, BitDepth::Sixteen, None, &data)).unwrap_err().to_string(),
+                format!("PNG is of 16 bits per value with colour or alpha, {NOT_SUPPORTED}")
+            );
         }
     }
 

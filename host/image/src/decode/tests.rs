@@ -3,13 +3,18 @@
 use super::samples::{self, HEIGHT, WIDTH, colour};
 use super::*;
 
+/// End of the error of a kind of file that is not decoded.
+pub(super) const NOT_SUPPORTED: &str =
+    "which is not supported: publish baseline JPEG, or PNG of 8 bits";
+
 /// Decodes `data` in the two steps that the host takes.
 pub(super) fn decoded(data: &[u8]) -> Result<Vec<u8>, ImageError> {
     let header = probe(data)?;
-    let len = header.rgb8_len().unwrap();
+    let len = header.decoded_len().unwrap();
     // Filled, so that pixels which are not written are noticed.
     let mut out = vec![0xaa; len];
-    decode_rgb8(data, &header, len, &mut out)?;
+    let max_bytes = header.rgb8_len().unwrap();
+    decode(data, &header, max_bytes, &mut out, &StopCheck::new(&|| true))?;
     Ok(out)
 }
 
@@ -23,6 +28,11 @@ pub(super) fn assert_close(rgb: &[u8], tolerance: u8, expected: impl Fn(usize, u
     }
 }
 
+/// Returns the header of an image of [`colour`].
+pub(super) fn rgb8_header(format: Format) -> ImageHeader {
+    ImageHeader { format, width: WIDTH, height: HEIGHT, encoding: Encoding::Rgb8 }
+}
+
 #[test]
 fn decoding_stops_when_its_caller_requests_it() {
     for file in
@@ -31,7 +41,7 @@ fn decoding_stops_when_its_caller_requests_it() {
         let header = probe(file).unwrap();
         let mut out = vec![0; header.rgb8_len().unwrap()];
         let mut decode = |may_go_on: &dyn Fn() -> bool| {
-            decode_rgb8_paced(file, &header, 1 << 20, &mut out, &StopCheck::new(may_go_on))
+            super::decode(file, &header, 1 << 20, &mut out, &StopCheck::new(may_go_on))
                 .map(|()| out.clone())
         };
         let stopped = decode(&|| false);
@@ -46,7 +56,7 @@ fn decoding_stops_when_its_caller_requests_it() {
 #[test]
 fn a_jpeg_decodes_to_the_encoded_colours() {
     for file in [&samples::BASELINE[..], &samples::PROGRESSIVE] {
-        let header = ImageHeader { format: Format::Jpeg, width: WIDTH, height: HEIGHT };
+        let header = rgb8_header(Format::Jpeg);
         assert_eq!(probe(file).unwrap(), header);
         // Pillow decodes them with errors of up to 6, and differs from this decoder by up to 2.
         assert_close(&decoded(file).unwrap(), 8, colour);
@@ -62,7 +72,7 @@ fn a_grey_jpeg_becomes_equal_red_green_and_blue() {
 fn a_jpeg_for_print_is_refused() {
     assert_eq!(
         probe(&samples::CMYK).unwrap_err().to_string(),
-        "JPEG is neither grey nor of three components (CMYK?), which is not supported"
+        format!("JPEG is neither grey nor of three components (CMYK?), {NOT_SUPPORTED}")
     );
 }
 
@@ -157,7 +167,7 @@ fn kinds_of_jpeg_that_cameras_do_not_send_are_named() {
         file[at + 1] = marker;
         assert_eq!(
             probe(&file).unwrap_err().to_string(),
-            format!("JPEG is {kind}, which is not supported")
+            format!("JPEG is {kind}, {NOT_SUPPORTED}")
         );
     }
     let twelve = patched(&samples::BASELINE, 0xc0, &[0, 17, 12]);
@@ -186,6 +196,39 @@ fn a_jpeg_with_endless_scans_is_refused() {
 }
 
 #[test]
+fn a_jpeg_without_huffman_tables_has_the_pixels_of_the_one_with_them() {
+    let head = &samples::BASELINE[..first(&samples::BASELINE, 0xc4)];
+    let mjpeg = [head, &samples::STANDARD_SCAN].concat();
+    let rgb = decoded(&mjpeg).unwrap();
+    assert_eq!(rgb, decoded(&samples::BASELINE).unwrap());
+    // Some pixels by Pillow, by their index.
+    let pillow: [(usize, [u8; 3]); 5] = [
+        (0, [81, 59, 194]),
+        (23, [171, 62, 129]),
+        (5 * 24 + 7, [108, 84, 168]),
+        (8 * 24 + 16, [144, 100, 136]),
+        (15 * 24 + 23, [172, 135, 106]),
+    ];
+    for (at, expected) in pillow {
+        let found = &rgb[3 * at..][..3];
+        assert!(found.iter().zip(expected).all(|(a, b)| a.abs_diff(b) <= 3), "{at}: {found:?}");
+    }
+}
+
+#[test]
+fn the_error_of_a_jpeg_carries_its_cause() {
+    // Its first table becomes data of an application.
+    let mut file = samples::BASELINE.to_vec();
+    let at = first(&file, 0xc4);
+    file[at + 1] = 0xef;
+    assert_eq!(
+        decoded(&file).unwrap_err().to_string(),
+        "cannot decode the JPEG of 24x16: Error decoding huffman values: \
+         No DC table for component Y"
+    );
+}
+
+#[test]
 fn a_jpeg_without_pixels_is_refused() {
     let mut file = samples::BASELINE.to_vec();
     file.truncate(first(&file, 0xda));
@@ -199,7 +242,7 @@ fn kinds_of_jpeg_that_the_decoder_decodes_wrong_are_refused() {
     let one_of_three = patched(&samples::BASELINE, 0xda, &[0, 8, 1, 1, 0, 0, 63, 0]);
     assert_eq!(
         decoded(&one_of_three).unwrap_err().to_string(),
-        "JPEG is sequential with components in scans of their own, which is not supported"
+        format!("JPEG is sequential with components in scans of their own, {NOT_SUPPORTED}")
     );
     for factors in [[0x11, 0x21, 0x21], [0x21, 0x12, 0x12], [0x22, 0x11, 0x21], [0x33, 0x11, 0x11]]
     {
@@ -234,6 +277,7 @@ fn no_mutation_of_a_file_causes_a_panic() {
         samples::PROGRESSIVE.to_vec(),
         samples::GREY.to_vec(),
         samples::INTERLACED.to_vec(),
+        samples::DEPTH_INTERLACED.to_vec(),
     ];
     let mut state = 1_u32;
     let mut random = |below: usize| {
@@ -249,8 +293,8 @@ fn no_mutation_of_a_file_causes_a_panic() {
             file[at] = random(256) as u8;
         }
         if let Ok(header) = probe(&file) {
-            let mut out = vec![0; header.rgb8_len().unwrap().min(1 << 20)];
-            let _ = decode_rgb8(&file, &header, 1 << 20, &mut out);
+            let mut out = vec![0; header.decoded_len().unwrap().min(1 << 20)];
+            let _ = super::decode(&file, &header, 1 << 20, &mut out, &StopCheck::new(&|| true));
         }
     }
 }

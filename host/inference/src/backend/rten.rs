@@ -4,23 +4,19 @@
 //! It computes in `f32`, `i32`, `i8` and `u8`: other types are converted at the edge.
 
 use std::borrow::Cow;
-use std::collections::BTreeSet;
 use std::sync::Arc;
 
-use gleaner_protocol::inference::{Element, TensorInfo};
+use gleaner_protocol::inference::Element;
 use rten::{Model, ModelOptions, NodeId, RunOptions, ThreadPool, Value, ValueOrView, ValueView};
 use rten_gemm::GemmExecutor;
 use rten_tensor::{Layout, Tensor, TensorView};
 
 use super::elements::{floats, from_floats, from_integers, integers, numbers};
 use super::{Backend, BackendError, LoadOptions, LoadedGraph, StopSignal, TensorValue};
+use crate::inspect::{OutputInfo, RtenFinding, RtenRuleKind};
 
 /// The version of rten, as the workspace pins it.
 const VERSION: &str = "rten 0.27.0";
-
-/// Operators that multiply 8-bit integers.
-const CONVOLUTION: &str = "ConvInteger";
-const PRODUCT: &str = "MatMulInteger";
 
 /// The backend of rten.
 #[derive(Debug, Clone, Copy, Default)]
@@ -30,7 +26,9 @@ struct RtenGraph {
     model: Model,
     pool: Arc<ThreadPool>,
     inputs: Vec<NodeId>,
-    outputs: Vec<(NodeId, TensorInfo)>,
+    outputs: Vec<(NodeId, OutputInfo)>,
+    /// The reason why a run with a NaN is refused.
+    hides_nan: Option<String>,
 }
 
 impl Backend for RtenBackend {
@@ -53,40 +51,32 @@ impl Backend for RtenBackend {
                 "`{name}` has elements of type {element}, which rten does not support"
             )));
         }
-        if let Some((operator, why)) = inexact(&signature.operators) {
-            return Err(BackendError::new(format_args!(
-                "it has operator `{operator}`, which rten computes inexactly {why}; use ONNX \
-                 Runtime, or a model of floats"
-            )));
+        let refuses = |finding: &&RtenFinding| match finding.kind {
+            RtenRuleKind::Model => true,
+            RtenRuleKind::Processor => products_saturate(),
+            RtenRuleKind::Nan => false,
+        };
+        match signature.rten.iter().find(refuses) {
+            Some(finding) => Err(BackendError::new(&finding.message)),
+            None => load(model, options),
         }
-        load(model, options)
     }
-}
-
-/// Returns an operator whose results would be wrong, without an error, and where.
-fn inexact(operators: &BTreeSet<String>) -> Option<(&'static str, &'static str)> {
-    // It pads with 0 in place of the zero point of its input, so that a usual quantized detector
-    // misses objects.
-    if operators.contains(CONVOLUTION) {
-        return Some((CONVOLUTION, "at padded edges"));
-    }
-    // On x86-64 without VNNI, sums of two products saturate in 16 bits.
-    let saturates = operators.contains(PRODUCT) && products_saturate();
-    saturates.then_some((PRODUCT, "on this processor, as that lacks VNNI"))
 }
 
 /// Loads a graph, whatever its operators are.
 fn load(model: Vec<u8>, options: &LoadOptions<'_>) -> Result<Box<dyn LoadedGraph>, BackendError> {
     let signature = options.signature;
-    let outputs = signature.outputs.iter().map(|output| &output.tensor);
     let model = ModelOptions::with_all_ops().load(model).map_err(BackendError::new)?;
     let node = |name: &str| model.node_id(name).map_err(BackendError::new);
     let inputs = signature.inputs.iter().map(|info| node(&info.name)).collect::<Result<_, _>>()?;
+    let outputs = signature.outputs.iter();
     let outputs = outputs
-        .map(|info| Ok((node(&info.name)?, info.clone())))
+        .map(|info| Ok((node(&info.tensor.name)?, info.clone())))
         .collect::<Result<_, BackendError>>()?;
+    let hides_nan = signature.rten.iter().find(|finding| finding.kind == RtenRuleKind::Nan);
+    let hides_nan = hides_nan.map(|finding| finding.message.clone());
     let pool = Arc::new(ThreadPool::with_num_threads(options.threads as usize));
-    Ok(Box::new(RtenGraph { model, pool, inputs, outputs }))
+    Ok(Box::new(RtenGraph { model, pool, inputs, outputs, hides_nan }))
 }
 
 impl LoadedGraph for RtenGraph {
@@ -95,6 +85,9 @@ impl LoadedGraph for RtenGraph {
         inputs: &[TensorValue],
         _stop: &StopSignal,
     ) -> Result<Vec<TensorValue>, BackendError> {
+        if let Some(reason) = self.hides_nan.as_ref().filter(|_| inputs.iter().any(has_nan)) {
+            return Err(BackendError::new(format_args!("an input has a NaN: {reason}")));
+        }
         let values =
             self.inputs.iter().zip(inputs).map(|(node, input)| Ok((*node, value_of(input)?)));
         let values = values.collect::<Result<Vec<_>, BackendError>>()?;
@@ -109,6 +102,12 @@ impl LoadedGraph for RtenGraph {
 /// Returns whether products of 8-bit integers are inexact on this processor.
 fn products_saturate() -> bool {
     GemmExecutor::<u8, i8, i32>::default().may_saturate()
+}
+
+fn has_nan(input: &TensorValue) -> bool {
+    let is_float = matches!(input.element, Element::Float32 | Element::Float16 | Element::Float64);
+    let values = is_float.then(|| floats(input.element, &input.bytes).ok()).flatten();
+    values.is_some_and(|values| values.iter().any(|value| value.is_nan()))
 }
 
 fn value_of(input: &TensorValue) -> Result<ValueOrView<'_>, BackendError> {
@@ -147,8 +146,15 @@ where
     }
 }
 
-fn output_of(info: &TensorInfo, value: Value) -> Result<TensorValue, BackendError> {
+fn output_of(output: &OutputInfo, value: Value) -> Result<TensorValue, BackendError> {
+    let info = &output.tensor;
     let lengths = value.shape();
+    if output.has_shape && lengths.len() != info.shape.len() {
+        let (name, declared, found) = (&info.name, info.shape.len(), lengths.len());
+        return Err(BackendError::new(format_args!(
+            "output `{name}` is declared with {declared} dimensions, and rten returned {found}"
+        )));
+    }
     let lengths = lengths.iter().map(|length| u32::try_from(*length));
     let shape = lengths.collect::<Result<Vec<_>, _>>().map_err(BackendError::new)?;
     let element = info.element;
@@ -174,105 +180,4 @@ fn output_of(info: &TensorInfo, value: Value) -> Result<TensorValue, BackendErro
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::inspect::inspect;
-    use crate::onnx::{INT8, INT32, UINT8, constant, graph, model, node, numbers_attribute, value};
-
-    const ZERO_POINTS: [(&str, i32); 2] = [("za", 10), ("zb", 128)];
-
-    /// A product of two 8-bit matrices with zero points.
-    fn product([rows, inner, columns]: [i64; 3]) -> Vec<u8> {
-        let zero_points =
-            ZERO_POINTS.map(|(name, value)| constant(name, UINT8, &[], &[value as u8]));
-        model(&graph(
-            &[node("MatMulInteger", &["a", "b", "za", "zb"], &["y"], &[])],
-            &zero_points,
-            &[value("a", UINT8, &[rows, inner]), value("b", UINT8, &[inner, columns])],
-            &[value("y", INT32, &[rows, columns])],
-        ))
-    }
-
-    /// A convolution of 2 x 2 values in 2 channels with weights of 1, padded by one. The zero point
-    /// is 10.
-    fn padded_convolution() -> Vec<u8> {
-        let constants =
-            [constant("w", INT8, &[1, 2, 3, 3], &[1; 18]), constant("z", UINT8, &[], &[10])];
-        let attributes = [("pads", 4), ("strides", 2), ("dilations", 2)]
-            .map(|(name, length)| numbers_attribute(name, &vec![1; length]));
-        model(&graph(
-            &[node("ConvInteger", &["x", "w", "z"], &["y"], &attributes)],
-            &constants,
-            &[value("x", UINT8, &[1, 2, 2, 2])],
-            &[value("y", INT32, &[1, 1, 2, 2])],
-        ))
-    }
-
-    /// Calls `test` with the options to load a model.
-    fn with_options<T>(model: &[u8], test: impl FnOnce(&LoadOptions<'_>) -> T) -> T {
-        let signature = inspect(model).unwrap();
-        let provider = super::super::ExecutionProvider::Cpu;
-        test(&LoadOptions { provider, threads: 1, signature: &signature, engine: None })
-    }
-
-    #[test]
-    fn convolutions_of_8_bit_integers_are_refused() {
-        let bytes = padded_convolution();
-        let refused =
-            with_options(&bytes, |options| RtenBackend.load(bytes.clone(), options).err());
-        assert_eq!(
-            refused.unwrap().to_string(),
-            "it has operator `ConvInteger`, which rten computes inexactly at padded edges; use \
-             ONNX Runtime, or a model of floats"
-        );
-    }
-
-    /// If this fails after an update of rten, its convolutions need not be refused any more.
-    #[test]
-    fn rten_still_pads_convolutions_of_8_bit_integers_with_another_value() {
-        let bytes = padded_convolution();
-        let mut graph = with_options(&bytes, |options| load(bytes.clone(), options).unwrap());
-        let zeros =
-            TensorValue { element: Element::Uint8, shape: vec![1, 2, 2, 2], bytes: vec![10; 8] };
-        let outputs = graph.run(&[zeros], &StopSignal::default()).unwrap();
-        println!("{:?}", outputs[0].bytes);
-        assert_ne!(outputs[0].bytes, [0; 16]);
-    }
-
-    #[test]
-    fn products_of_8_bit_integers_are_exact_or_refused() {
-        // Multiples of the tiles of rten, and numbers that are none.
-        for shape in [[8, 64, 32], [7, 67, 33], [1, 18, 5], [1, 3, 1]] {
-            let bytes = product(shape);
-            let loaded = with_options(&bytes, |options| RtenBackend.load(bytes.clone(), options));
-            let mut graph = match loaded {
-                Ok(graph) => graph,
-                Err(error) => {
-                    assert!(products_saturate(), "{error}");
-                    return assert!(error.to_string().contains("`MatMulInteger`"), "{error}");
-                }
-            };
-            let [rows, inner, columns] = shape.map(|length| length as usize);
-            let matrix = |rows: usize, columns: usize| TensorValue {
-                element: Element::Uint8,
-                shape: vec![rows as u32, columns as u32],
-                // The largest value is among them.
-                bytes: (0..rows * columns).map(|index| 255 - (index * 37 % 251) as u8).collect(),
-            };
-            let (a, b) = (matrix(rows, inner), matrix(inner, columns));
-            let [za, zb] = ZERO_POINTS.map(|(_, value)| value);
-            let dot = |index: usize| -> i32 {
-                let (row, column) = (index / columns, index % columns);
-                let product = |k| {
-                    let a = i32::from(a.bytes[row * inner + k]) - za;
-                    a * (i32::from(b.bytes[k * columns + column]) - zb)
-                };
-                (0..inner).map(product).sum()
-            };
-            let expected: Vec<u8> =
-                (0..rows * columns).flat_map(|index| dot(index).to_le_bytes()).collect();
-            let outputs = graph.run(&[a.clone(), b.clone()], &StopSignal::default()).unwrap();
-            assert!(outputs[0].bytes == expected, "{shape:?}");
-        }
-    }
-}
+mod tests;

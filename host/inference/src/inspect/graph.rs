@@ -1,6 +1,6 @@
 //! Checks graphs with everything in them: nodes, attributes, subgraphs and constants.
 
-use std::collections::{BTreeSet, HashSet};
+use std::collections::HashSet;
 
 use super::InspectError;
 use super::wire::{WireField, WireFields, WireValue};
@@ -19,11 +19,11 @@ pub(super) mod graph_field {
 }
 
 /// Fields of `NodeProto`.
-mod node_field {
-    pub(super) const INPUT: u64 = 1;
-    pub(super) const OUTPUT: u64 = 2;
-    pub(super) const OPERATOR: u64 = 4;
-    pub(super) const ATTRIBUTE: u64 = 5;
+pub(super) mod node_field {
+    pub(in crate::inspect) const INPUT: u64 = 1;
+    pub(in crate::inspect) const OUTPUT: u64 = 2;
+    pub(in crate::inspect) const OPERATOR: u64 = 4;
+    pub(in crate::inspect) const ATTRIBUTE: u64 = 5;
     pub(super) const DOMAIN: u64 = 7;
 }
 
@@ -34,11 +34,15 @@ mod function_field {
 }
 
 /// Fields of `AttributeProto`.
-mod attribute_field {
-    pub(super) const TENSOR: u64 = 5;
-    pub(super) const GRAPH: u64 = 6;
+pub(super) mod attribute_field {
+    pub(in crate::inspect) const NAME: u64 = 1;
+    pub(in crate::inspect) const NUMBER: u64 = 3;
+    pub(in crate::inspect) const TEXT: u64 = 4;
+    pub(in crate::inspect) const TENSOR: u64 = 5;
+    pub(in crate::inspect) const GRAPH: u64 = 6;
+    pub(in crate::inspect) const NUMBERS: u64 = 8;
     pub(super) const TENSORS: u64 = 10;
-    pub(super) const GRAPHS: u64 = 11;
+    pub(in crate::inspect) const GRAPHS: u64 = 11;
     pub(super) const TYPE: u64 = 14;
     pub(super) const TYPES: u64 = 15;
     pub(super) const SPARSE_TENSOR: u64 = 22;
@@ -46,19 +50,20 @@ mod attribute_field {
 }
 
 /// Fields of `TensorProto`.
-mod tensor_field {
+pub(super) mod tensor_field {
+    pub(in crate::inspect) const DIMS: u64 = 1;
+    pub(in crate::inspect) const DATA_TYPE: u64 = 2;
+    pub(in crate::inspect) const FLOAT_DATA: u64 = 4;
     pub(super) const INT32_DATA: u64 = 5;
-    pub(super) const NAME: u64 = 8;
-    pub(super) const RAW_DATA: u64 = 9;
+    pub(in crate::inspect) const INT64_DATA: u64 = 7;
+    pub(in crate::inspect) const NAME: u64 = 8;
+    pub(in crate::inspect) const RAW_DATA: u64 = 9;
     pub(super) const EXTERNAL_DATA: u64 = 13;
     pub(super) const DATA_LOCATION: u64 = 14;
 }
 
 /// Value of `DATA_LOCATION` for data in the model itself.
 const DEFAULT_LOCATION: i64 = 0;
-
-/// Names of the operators in the checked part of a model.
-pub(super) type Operators = BTreeSet<String>;
 
 /// An operator with random results, unless its third input is absent or false.
 const DROPOUT: &str = "Dropout";
@@ -79,11 +84,7 @@ pub(super) fn is_standard(domain: &str) -> bool {
 }
 
 /// Checks a graph and its subgraphs.
-pub(super) fn check_graph(
-    graph: &[u8],
-    depth: usize,
-    operators: &mut Operators,
-) -> Result<(), InspectError> {
+pub(super) fn check_graph(graph: &[u8], depth: usize) -> Result<(), InspectError> {
     if depth > MAX_DEPTH {
         return Err(InspectError::TooDeep { max: MAX_DEPTH });
     }
@@ -91,7 +92,7 @@ pub(super) fn check_graph(
     for field in WireFields(graph) {
         let field = field?;
         match field.number {
-            graph_field::NODE => switches.extend(check_node(field.fields()?, depth, operators)?),
+            graph_field::NODE => switches.extend(check_node(field.fields()?, depth)?),
             graph_field::INITIALIZER => check_tensor(field.fields()?)?,
             graph_field::SPARSE_INITIALIZER => check_sparse(field)?,
             graph_field::INPUT | graph_field::OUTPUT | graph_field::VALUE_INFO => {
@@ -174,18 +175,15 @@ fn random(operator: &str) -> InspectError {
 }
 
 /// Checks a function of the model, which is a graph without constants.
-pub(super) fn check_functions(
-    function: &[u8],
-    operators: &mut Operators,
-) -> Result<(), InspectError> {
+pub(super) fn check_functions(function: &[u8]) -> Result<(), InspectError> {
     for field in WireFields(function) {
         let field = field?;
         match field.number {
             // The caller of a function gives the value.
-            function_field::NODE if check_node(field.fields()?, 0, operators)?.is_some() => {
+            function_field::NODE if check_node(field.fields()?, 0)?.is_some() => {
                 return Err(random(DROPOUT));
             }
-            function_field::ATTRIBUTE => check_attribute(field.fields()?, 0, operators)?,
+            function_field::ATTRIBUTE => check_attribute(field.fields()?, 0)?,
             _ => {}
         }
     }
@@ -193,11 +191,7 @@ pub(super) fn check_functions(
 }
 
 /// Checks a node; returns the value that makes it random if it is not false.
-fn check_node<'a>(
-    node: WireFields<'a>,
-    depth: usize,
-    operators: &mut Operators,
-) -> Result<Option<&'a str>, InspectError> {
+fn check_node(node: WireFields<'_>, depth: usize) -> Result<Option<&str>, InspectError> {
     let (mut domain, mut operator, mut inputs, mut third) = ("", "", 0_usize, "");
     for field in node {
         let field = field?;
@@ -210,7 +204,7 @@ fn check_node<'a>(
             }
             node_field::OPERATOR => operator = field.text()?,
             node_field::DOMAIN => domain = field.text()?,
-            node_field::ATTRIBUTE => check_attribute(field.fields()?, depth, operators)?,
+            node_field::ATTRIBUTE => check_attribute(field.fields()?, depth)?,
             _ => {}
         }
     }
@@ -218,24 +212,17 @@ fn check_node<'a>(
         return Err(random(operator));
     }
     if is_standard(domain) {
-        if !operators.contains(operator) {
-            operators.insert(operator.to_owned());
-        }
         return Ok(Some(third).filter(|name| operator == DROPOUT && !name.is_empty()));
     }
     Err(InspectError::Domain { domain: domain.to_owned(), operator: operator.to_owned() })
 }
 
-fn check_attribute(
-    attribute: WireFields<'_>,
-    depth: usize,
-    operators: &mut Operators,
-) -> Result<(), InspectError> {
+fn check_attribute(attribute: WireFields<'_>, depth: usize) -> Result<(), InspectError> {
     for field in attribute {
         let field = field?;
         match field.number {
             attribute_field::GRAPH | attribute_field::GRAPHS => {
-                check_graph(field.bytes()?, depth + 1, operators)?;
+                check_graph(field.bytes()?, depth + 1)?;
             }
             attribute_field::TENSOR | attribute_field::TENSORS => check_tensor(field.fields()?)?,
             attribute_field::SPARSE_TENSOR | attribute_field::SPARSE_TENSORS => {

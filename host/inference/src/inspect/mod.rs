@@ -3,12 +3,15 @@
 //! - `wire`: fields of protobuf messages.
 //! - `graph`: graphs, nodes and attributes: operators, data in other files, depth.
 //! - `signature`: inputs and outputs.
+//! - `facts`: nodes, and what is declared of values. `rten_rules`: what rten computes wrongly.
 //!
 //! These are own checks: the types of `rten-onnx` copy all weights, take memory for a length before
 //! they compare it with the file, follow subgraphs to any depth, and have no functions and no
 //! sparse tensors.
 
+mod facts;
 mod graph;
+mod rten_rules;
 mod signature;
 #[cfg(test)]
 mod tests;
@@ -16,9 +19,11 @@ mod wire;
 
 use gleaner_protocol::inference::Element;
 
-use graph::{Operators, check_functions, check_graph};
+use facts::GraphFacts;
+use graph::{check_functions, check_graph};
 use wire::{NoMessage, WireFields};
 
+pub use rten_rules::{RTEN_RULES, RtenFinding, RtenRule, RtenRuleKind};
 pub use signature::{ModelSignature, OutputInfo};
 
 /// Oldest version of the standard operators that is accepted.
@@ -29,11 +34,18 @@ const NEWEST_OPSET: i64 = 24;
 /// Largest number of inputs and of outputs.
 const MAX_TENSORS: usize = 256;
 
+/// Keys of the metadata that describe a detector; Ultralytics writes them.
+const METADATA: [&str; 5] = ["task", "head", "stride", "end2end", "names"];
+
+/// Most bytes of their values, so that they fit into a message; the names of COCO have 1.3 kB.
+const METADATA_MAX: usize = 16 << 10;
+
 /// Fields of `ModelProto`.
 mod model_field {
     pub(super) const IR_VERSION: u64 = 1;
     pub(super) const GRAPH: u64 = 7;
     pub(super) const OPSET: u64 = 8;
+    pub(super) const METADATA: u64 = 14;
     pub(super) const FUNCTIONS: u64 = 25;
 }
 
@@ -94,7 +106,7 @@ fn elements() -> String {
 /// [`InspectError`] names the first problem.
 pub fn inspect(model: &[u8]) -> Result<ModelSignature, InspectError> {
     let (mut graph, mut has_version, mut opset) = (None, false, None);
-    let mut operators = Operators::new();
+    let (mut has_functions, mut metadata, mut metadata_bytes) = (false, Vec::new(), 0);
     for field in WireFields(model) {
         let field = field?;
         match field.number {
@@ -108,19 +120,48 @@ pub fn inspect(model: &[u8]) -> Result<ModelSignature, InspectError> {
                     opset = Some(version);
                 }
             }
-            model_field::FUNCTIONS => check_functions(field.bytes()?, &mut operators)?,
+            model_field::METADATA => {
+                let (key, value) = entry_of(field.fields()?)?;
+                let is_plain = !value.contains(char::is_control);
+                let is_read = is_plain && METADATA.contains(&key);
+                metadata_bytes += if is_read { value.len() } else { 0 };
+                if is_read && metadata_bytes <= METADATA_MAX {
+                    metadata.push((key.to_owned(), value.to_owned()));
+                }
+            }
+            model_field::FUNCTIONS => {
+                has_functions = true;
+                check_functions(field.bytes()?)?;
+            }
             _ => {}
         }
     }
     let graph = graph.filter(|_| has_version).ok_or(InspectError::NoModel)?;
-    check_graph(graph, 0, &mut operators)?;
+    check_graph(graph, 0)?;
     // After the operators: a model of foreign ones only may import no others.
-    match opset {
-        Some(OLDEST_OPSET..=NEWEST_OPSET) => {}
+    let opset = match opset {
+        Some(version @ OLDEST_OPSET..=NEWEST_OPSET) => version,
         Some(version) => return Err(InspectError::Opset { version }),
         None => return Err(InspectError::NoOpset),
+    };
+    let signature = ModelSignature::of(graph)?;
+    let rten = rten_rules::findings(&GraphFacts::of(graph, opset)?, has_functions);
+    Ok(ModelSignature { rten, metadata, ..signature })
+}
+
+/// Returns key and value of an entry of the metadata.
+fn entry_of(fields: WireFields<'_>) -> Result<(&str, &str), NoMessage> {
+    let (mut key, mut value) = ("", "");
+    for field in fields {
+        let field = field?;
+        match field.number {
+            1 => key = field.text()?,
+            // Only the values of known keys are read.
+            2 => value = field.text().unwrap_or_default(),
+            _ => {}
+        }
     }
-    ModelSignature::of(graph, operators)
+    Ok((key, value))
 }
 
 fn opset_of(fields: WireFields<'_>) -> Result<(&str, i64), NoMessage> {

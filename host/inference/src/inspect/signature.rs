@@ -1,10 +1,11 @@
 //! Reads the inputs and outputs of a model.
 
-use std::collections::{BTreeSet, HashSet};
+use std::collections::HashSet;
 
 use gleaner_protocol::inference::{Element, MAX_DIMENSIONS, TensorInfo};
 
 use super::graph::graph_field;
+use super::rten_rules::RtenFinding;
 use super::wire::{NoMessage, WireField, WireFields};
 use super::{InspectError, MAX_TENSORS};
 
@@ -39,8 +40,10 @@ pub struct ModelSignature {
     pub inputs: Vec<TensorInfo>,
     /// Its outputs.
     pub outputs: Vec<OutputInfo>,
-    /// Names of its operators, in subgraphs and functions, too.
-    pub operators: BTreeSet<String>,
+    /// Rules of rten that hold for it.
+    pub rten: Vec<RtenFinding>,
+    /// Entries of its metadata that describe a detector, by key.
+    pub metadata: Vec<(String, String)>,
 }
 
 /// An output of a model.
@@ -53,28 +56,25 @@ pub struct OutputInfo {
 }
 
 /// A declared value.
-struct DeclaredValue<'a> {
-    name: &'a str,
-    tensor: Option<DeclaredTensor>,
+pub(super) struct DeclaredValue<'a> {
+    pub(super) name: &'a str,
+    pub(super) tensor: Option<DeclaredTensor>,
     /// Name of its type, if it is no tensor.
     other: Option<&'static str>,
 }
 
 #[derive(Default)]
-struct DeclaredTensor {
-    element: Option<i64>,
+pub(super) struct DeclaredTensor {
+    pub(super) element: Option<i64>,
     /// The first lengths, as many as a tensor may have.
-    shape: Option<Vec<i64>>,
+    pub(super) shape: Option<Vec<i64>>,
     /// Number of dimensions.
-    dimensions: usize,
+    pub(super) dimensions: usize,
 }
 
 impl ModelSignature {
     /// Reads the inputs and outputs of a graph.
-    pub(super) fn of(
-        graph: &[u8],
-        operators: BTreeSet<String>,
-    ) -> Result<ModelSignature, InspectError> {
+    pub(super) fn of(graph: &[u8]) -> Result<ModelSignature, InspectError> {
         // Constants first: older models declare each as an input, too.
         let mut constants = HashSet::new();
         for field in WireFields(graph) {
@@ -112,7 +112,7 @@ impl ModelSignature {
             outputs.iter().map(|output| output.info("output")).collect::<Result<_, _>>()?;
         distinct("input", inputs.iter().map(|info| info.name.as_str()))?;
         distinct("output", outputs.iter().map(|info| info.tensor.name.as_str()))?;
-        Ok(ModelSignature { inputs, outputs, operators })
+        Ok(ModelSignature { inputs, outputs, ..ModelSignature::default() })
     }
 }
 
@@ -143,7 +143,7 @@ fn name_of_tensor<'a>(tensor: WireField<'a>) -> Result<&'a str, NoMessage> {
 }
 
 impl<'a> DeclaredValue<'a> {
-    fn of(value: WireField<'a>) -> Result<Self, NoMessage> {
+    pub(super) fn of(value: WireField<'a>) -> Result<Self, NoMessage> {
         let mut declared = DeclaredValue { name: "", tensor: None, other: None };
         for field in value.fields()? {
             let field = field?;

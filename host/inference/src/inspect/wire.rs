@@ -40,6 +40,19 @@ impl<'a> WireField<'a> {
         self.bytes().map(WireFields)
     }
 
+    /// Adds the numbers of a list, which is one of them, or all of them packed.
+    pub(super) fn numbers(&self, list: &mut Vec<i64>) -> Result<(), NoMessage> {
+        let WireValue::Bytes(packed) = self.value else {
+            list.push(self.number()?);
+            return Ok(());
+        };
+        let mut packed = WireFields(packed);
+        while !packed.0.is_empty() {
+            list.push(packed.varint()?.cast_signed());
+        }
+        Ok(())
+    }
+
     /// Returns a number; negative ones are encoded as the 64 bits of their two's complement.
     pub(super) fn number(&self) -> Result<i64, NoMessage> {
         match self.value {
@@ -130,6 +143,11 @@ mod tests {
             (fields.len(), fields[0].number(), texts.collect::<String>())
         });
         assert_eq!(read, Ok((4, Ok(150), "hi".to_owned())));
+        let mut listed = Vec::new();
+        for field in fields(&[0x08, 7, 0x0a, 3, 0x96, 0x01, 2]).unwrap() {
+            field.numbers(&mut listed).unwrap();
+        }
+        assert_eq!(listed, [7, 150, 2]);
         let minus_one = [&[0x08][..], &[0xff; 9], &[1]].concat();
         assert_eq!(fields(&minus_one).unwrap()[0].number(), Ok(-1));
     }

@@ -72,6 +72,7 @@ impl ModelProgram {
         let mut child = Command::new(env!("CARGO_BIN_EXE_gleaner-inference"))
             .args(args)
             .env_remove("ORT_DYLIB_PATH")
+            .env_remove("VIRTUAL_ENV")
             .stdin(OwnedFd::from(stdin))
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())
@@ -270,7 +271,7 @@ impl ModelUser {
         deadline: Option<Duration>,
     ) -> Result<OpenedModel, ModelFault> {
         match self.call(ModelCall::Open { model: model.to_owned() }, deadline).0? {
-            ModelResult::Opened { inputs, outputs, runtime } => {
+            ModelResult::Opened { inputs, outputs, runtime, .. } => {
                 Ok(OpenedModel { inputs, outputs, runtime })
             }
             other => panic!("{other:?}"),

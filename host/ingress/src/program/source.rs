@@ -12,7 +12,8 @@ use super::network::NetworkError;
 pub(super) fn open(args: Args, real_time: bool) -> Result<Box<dyn LiveSource>, Failure> {
     let clock = args.clock();
     if !args.is_of_network() {
-        let options = DriveOptions { unpack_in: args.unpack_in, ..DriveOptions::default() };
+        let options =
+            DriveOptions { unpack_in: args.unpack_in, merge: true, ..DriveOptions::default() };
         let drive = DrivePlayer::open(&args.drive, &options, clock, args.rate);
         return Ok(Box::new(drive.map_err(|error| unplayable(&error))?));
     }

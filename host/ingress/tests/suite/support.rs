@@ -171,6 +171,8 @@ pub fn meta(seq: u64) -> SampleMeta {
         seq,
         endian: Endian::Little,
         options: [0; 2],
+        layout: 0,
+        is_latched: false,
     }
 }
 

@@ -8,25 +8,30 @@
 //!
 //! Allocations are bounded by the size of the response, and every name is checked.
 //!
-//! Sources: REP 2016 and the `.msg` and `.srv` files of `type_description_interfaces`; the hash is
-//! SHA-256 of the fields as JSON, in the form of `rcl_calculate_type_hash`.
+//! Sources: REP 2016 and the `.msg` and `.srv` files of `type_description_interfaces`.
 
+mod hash;
+
+use std::borrow::Cow;
 use std::collections::HashMap;
 use std::fmt::Write as _;
 use std::sync::Arc;
 
 use gleaner_base::chain;
-use sha2::{Digest, Sha256};
 
 use super::cdr::{CdrError, Cursor, Endian};
-use super::definitions::{Definitions, full_name, short_name};
+use super::definitions::{Definitions, MessageError, full_name, short_name};
 use super::encode::CdrWriter;
 use super::sources::{SourcesError, collect_types, is_name};
+use hash::hash;
+pub use hash::type_hash;
 
-/// Prefix of hashes of the first, and so far only, version.
-const VERSION: &str = "RIHS01_";
 /// The encoding of texts that are `.msg` files.
 const MSG: &str = "msg";
+/// The types of kinds 2 to 11.
+const NUMBERS: [&str; 10] = [
+    "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64",
+];
 
 /// The prefix by which rmw_cyclonedds matches a response to its request.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
@@ -60,6 +65,8 @@ pub enum TypeDescriptionError {
     Kind { field: String, kind: u8 },
     #[error("its definition cannot be used")]
     Definition(#[from] SourcesError),
+    #[error("the definition cannot be used")]
+    Text(#[from] MessageError),
 }
 
 /// Encodes a request for `type_name` with `hash`, texts included; preceded by `header`, if given.
@@ -93,7 +100,7 @@ impl DescribedDefinitions {
     ) -> Result<Self, TypeDescriptionError> {
         let response = TypeResponse::read(&mut Cursor::new(cdr, endian))?;
         let root = short_name(type_name);
-        let found = short_name(response.types[0].name);
+        let found = short_name(&response.types[0].name);
         if found != root {
             return Err(TypeDescriptionError::Another { found: cut(&found) });
         }
@@ -118,16 +125,17 @@ struct TypeResponse<'a> {
 }
 
 struct TypeFields<'a> {
-    name: &'a str,
+    name: Cow<'a, str>,
     fields: Vec<TypeField<'a>>,
 }
 
+#[derive(Clone)]
 struct TypeField<'a> {
     name: &'a str,
     kind: u8,
     capacity: u64,
     text_capacity: u64,
-    nested: &'a str,
+    nested: Cow<'a, str>,
 }
 
 impl<'a> TypeResponse<'a> {
@@ -152,7 +160,7 @@ impl<'a> TypeResponse<'a> {
 
 impl<'a> TypeFields<'a> {
     fn read(cdr: &mut Cursor<'a>) -> Result<Self, CdrError> {
-        let name = cdr.text()?;
+        let name = cdr.text()?.into();
         let mut fields = Vec::new();
         // Minimum size: three empty strings and 17 bytes of numbers.
         for _ in 0..cdr.count(29)? {
@@ -161,7 +169,7 @@ impl<'a> TypeFields<'a> {
                 kind: cdr.u8()?,
                 capacity: cdr.u64()?,
                 text_capacity: cdr.u64()?,
-                nested: cdr.text()?,
+                nested: cdr.text()?.into(),
             };
             // Skip the default value, which is not in the messages.
             cdr.skip_text()?;
@@ -169,38 +177,6 @@ impl<'a> TypeFields<'a> {
         }
         Ok(Self { name, fields })
     }
-}
-
-/// Returns the hash of types. Their names are valid, so nothing in the JSON has to be escaped.
-fn hash(types: &[TypeFields<'_>]) -> Result<String, TypeDescriptionError> {
-    let one = |one: &TypeFields<'_>| -> Result<String, TypeDescriptionError> {
-        let name = a_type(one.name)?;
-        let fields = one.fields.iter().map(|field| {
-            let nested = if field.nested.is_empty() { "" } else { a_type(field.nested)? };
-            Ok(format!(
-                "{{\"name\": \"{}\", \"type\": {{\"type_id\": {}, \"capacity\": {}, \
-                 \"string_capacity\": {}, \
-                 \"nested_type_name\": \"{nested}\"}}}}",
-                a_word(field.name)?,
-                field.kind,
-                field.capacity,
-                field.text_capacity,
-            ))
-        });
-        let fields: Vec<String> = fields.collect::<Result<_, TypeDescriptionError>>()?;
-        Ok(format!("{{\"type_name\": \"{name}\", \"fields\": [{}]}}", fields.join(", ")))
-    };
-    let types: Vec<String> = types.iter().map(one).collect::<Result<_, TypeDescriptionError>>()?;
-    let json = format!(
-        "{{\"type_description\": {}, \"referenced_type_descriptions\": [{}]}}",
-        types[0],
-        types[1..].join(", ")
-    );
-    let digest = Sha256::digest(json);
-    Ok(digest.iter().fold(VERSION.to_owned(), |mut hash, byte| {
-        let _ = write!(hash, "{byte:02x}");
-        hash
-    }))
 }
 
 /// Generates the text of `.msg` files with these fields.
@@ -211,7 +187,7 @@ fn from_fields(root: &str, types: &[TypeFields<'_>]) -> Result<Arc<str>, TypeDes
         for field in &one.fields {
             let _ = writeln!(text, "{} {}", in_msg(field)?, field.name);
         }
-        texts.insert(short_name(one.name), text);
+        texts.insert(short_name(&one.name), text);
     }
     collected(root, &texts)
 }
@@ -246,16 +222,12 @@ fn collected(
 fn in_msg(field: &TypeField<'_>) -> Result<String, TypeDescriptionError> {
     let unknown = || TypeDescriptionError::Kind { field: cut(field.name), kind: field.kind };
     let base = match field.kind % 48 {
-        1 => short_name(a_type(field.nested)?),
+        1 => short_name(a_type(&field.nested)?),
         21 => format!("string<={}", field.text_capacity),
         22 => format!("wstring<={}", field.text_capacity),
         kind => {
-            const NAMES: [&str; 10] = [
-                "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64",
-                "float32", "float64",
-            ];
             let name = match kind {
-                2..=11 => NAMES[usize::from(kind) - 2],
+                2..=11 => NUMBERS[usize::from(kind) - 2],
                 13 => "char",
                 15 => "bool",
                 16 => "byte",

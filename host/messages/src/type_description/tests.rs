@@ -1,5 +1,7 @@
 //! Tests with responses made by hand.
 
+use sha2::{Digest, Sha256};
+
 use super::*;
 
 const STRING: &str = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18";
@@ -53,6 +55,66 @@ fn the_hashes_are_those_of_ros_2() {
     let string = response(&[("std_msgs/msg/String", &[("data", 17, "")])], &[]);
     assert_eq!(&*read("std_msgs/msg/String", STRING, &string).unwrap().text, "string data\n");
     assert!(read("std_msgs/msg/Header", HEADER, &response(HEADER_TYPES, &[])).is_ok());
+}
+
+/// The published hashes: those of `test_msgs`, as rosidl of Kilted generated them, and of
+/// `sensor_msgs` of Humble and Jazzy.
+#[test]
+fn the_hashes_of_texts_are_those_that_nodes_announce() {
+    let with_defaults = |ty: &str, name: &str, count: usize| {
+        let line = |n| format!("{ty} {name}_default{n} \"a=b # c\" # d\n");
+        format!("{ty} {name}\n") + &(1..=count).map(line).collect::<String>()
+    };
+    let strings = "\u{feff}".to_owned()
+        + &with_defaults("string", "string_value", 5)
+        + "string CONST=\"=\"\n"
+        + &with_defaults("string<=22", "bounded_string_value", 5);
+    let wide = with_defaults("wstring", "wstring_value", 3)
+        + "wstring[3] array_of_wstrings\nwstring[<=3] bounded_sequence_of_wstrings\n"
+        + "wstring[] unbounded_sequence_of_wstrings";
+    let types = "bool byte char float32 float64 int8 uint8 int16 uint16 int32 uint32 int64 uint64";
+    let numbers: String = types.split(' ').map(|ty| format!("{ty} {ty}_value 1\n")).collect();
+    let range = crate::Sources::default().find("sensor_msgs/Range").unwrap().unwrap();
+    let newer = range.replacen("float32 range\n", "float32 range\nfloat32 variance\n", 1);
+    let types = [
+        ("test_msgs/Strings", strings.as_str()),
+        ("test_msgs/msg/WStrings", &wide),
+        ("test_msgs/Defaults", &numbers),
+        ("test_msgs/Constants", "uint8 A=1"),
+        ("sensor_msgs/Range", &range),
+        ("sensor_msgs/Range", &newer),
+    ];
+    let hashes = [
+        "eee55533636293ac7c94c62432eedb5777eb849847d2a17b4dcead8c4a20ab32",
+        "5a2c8ddb2054600023b9a180652f2ba895373217cad4b1f0fc1258c9e4424a79",
+        "a725ee02bf25a224cb7d14015a0245b6654ff591ae1ac277e2a2673f013ea6d2",
+        "983e7ae7099d65b3030c31c2890b0ec2b332484fae9f28c68e01340c8f61edcf",
+        "9430b1915b94d4268ff903679e8ecd09b6a67d331bd028738ec1eeb592891ebd",
+        "b42b62562e93cbfe9d42b82fe5994dfa3d63d7d5c90a317981703f7388adff3a",
+    ];
+    for ((name, text), hash) in types.into_iter().zip(hashes) {
+        assert_eq!(type_hash(name, text).unwrap(), format!("RIHS01_{hash}"), "{name}");
+    }
+    assert!(type_hash("car_msgs/action/Spin", "uint8 a").is_err());
+    assert!(type_hash("car_msgs/Spin", "what is this").is_err());
+}
+
+/// The digest of the lines `TYPE HASH` of all bundled types, sorted, with the hashes of rosbags
+/// 0.11.9 (`Typestore.hash_rihs01`); only of `std_msgs/msg/Char` that of rosidl, since rosbags does
+/// not take `char` for `uint8`.
+#[test]
+fn the_hashes_of_all_bundled_types_are_those_of_another_program() {
+    let bundled = include_str!("../bundled.msgs");
+    let names = bundled.split("MSG: ").skip(1).filter_map(|part| part.split_once('\n'));
+    let line = |(name, _): (&str, &str)| {
+        let text = crate::Sources::default().find(name).unwrap().unwrap();
+        format!("{} {}\n", full_name(name), type_hash(name, &text).unwrap())
+    };
+    let mut lines: Vec<String> = names.map(line).collect();
+    lines.sort_unstable();
+    let digest = Sha256::digest(lines.concat());
+    let expected = "01b04e8607bf7889b5f3ebdec8bcc49e8626dba202a21973a21599aacc9746e2";
+    assert_eq!((lines.len(), format!("{digest:x}").as_str()), (143, expected), "{lines:#?}");
 }
 
 #[test]
@@ -134,7 +196,7 @@ fn invalid_names_and_kinds_are_refused() {
         assert!(error.contains("invalid name"), "{nested}: {error}");
     }
     for kind in [0, 12, 14, 19, 20, 23, 47, 48, 60, 192, 255] {
-        let field = TypeField { name: "a", kind, capacity: 1, text_capacity: 1, nested: "" };
+        let field = TypeField { name: "a", kind, capacity: 1, text_capacity: 1, nested: "".into() };
         assert!(matches!(in_msg(&field), Err(TypeDescriptionError::Kind { .. })), "{kind}");
     }
 }
@@ -152,7 +214,14 @@ fn every_kind_that_a_file_can_express_is_generated() {
         (144 + 16, "", "byte[]"),
     ] {
         assert_eq!(
-            in_msg(&TypeField { name: "a", kind, capacity: 9, text_capacity: 5, nested }).unwrap(),
+            in_msg(&TypeField {
+                name: "a",
+                kind,
+                capacity: 9,
+                text_capacity: 5,
+                nested: nested.into()
+            })
+            .unwrap(),
             expected
         );
     }

@@ -189,7 +189,7 @@ pub(super) fn topic(topic: &ClipTopic, found: Option<&WrittenTopic>) -> Metadata
             "checksum",
             found.map_or_else(|| WrittenTopic::default().checksum(), WrittenTopic::checksum),
         ),
-        ("definitions", known(found.and_then(|found| found.definitions.clone()))),
+        ("definitions", known(found.and_then(WrittenTopic::definitions))),
         ("lost", known(topic.lost)),
         ("messages", topic.messages.to_string()),
         ("overwritten", known(topic.overwritten)),

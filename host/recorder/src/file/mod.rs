@@ -88,15 +88,26 @@ pub struct TopicSchema {
     pub type_name: String,
     /// ros2msg text of the type and all types that it uses; `None` if it is not available.
     pub definitions: Option<Arc<str>>,
+    /// The same for further layouts of the type, from number 1 on.
+    pub other_definitions: Vec<Arc<str>>,
     /// The quality of service that its writers offer, as rosbag2 writes it.
     pub offered_qos: Option<String>,
 }
 
 impl TopicSchema {
+    /// Returns the definitions of the layout with this number.
+    pub(crate) fn layout(&self, number: u16) -> Option<&Arc<str>> {
+        match number.checked_sub(1) {
+            None => self.definitions.as_ref(),
+            Some(other) => self.other_definitions.get(usize::from(other)),
+        }
+    }
+
     /// Checks that a clip has room for the topic's description. The fields of the file allow more,
     /// but every reader of a file holds the descriptions in memory.
     pub(crate) fn check(&self) -> Result<(), RecordError> {
-        let definitions = self.definitions.as_deref().map_or(0, str::len);
+        let texts = self.definitions.iter().chain(&self.other_definitions);
+        let definitions: usize = texts.map(|text| text.len()).sum();
         let description = definitions + self.offered_qos.as_deref().map_or(0, str::len);
         let parts = [
             ("name", self.name.len(), NAME_MAX),

@@ -55,6 +55,7 @@ impl ClipReader {
                 name: spec.topic,
                 type_name: spec.type_name,
                 definitions: found.definitions_text,
+                other_definitions: found.other_definitions,
                 offered_qos: found.offered_qos,
             });
         }
@@ -99,7 +100,10 @@ pub(super) fn written(path: &Path) -> Result<Written, RecordError> {
     let mut reader = ClipReader::open(path, DriveLimits::default())?;
     let mut written = Written::default();
     for topic in &reader.topics {
-        written.add_topic(topic);
+        let index = written.add_topic(topic);
+        for text in topic.definitions.iter().chain(&topic.other_definitions) {
+            written.add_definitions(index, text);
+        }
     }
     while reader
         .next(|topic, meta, cdr| written.count(topic, meta, cdr))

@@ -77,7 +77,23 @@ struct Channels {
 struct TopicChannels {
     /// Index in [`Written::topics`].
     index: usize,
-    by_writer: HashMap<Option<Guid>, u16>,
+    by_writer: HashMap<ChannelKey, u16>,
+}
+
+/// Common properties of the messages of a channel, beside their topic.
+#[derive(Copy, Clone, Default, PartialEq, Eq, Hash)]
+struct ChannelKey {
+    writer: Option<Guid>,
+    /// Number of the layout.
+    layout: u16,
+    is_latched: bool,
+}
+
+impl ChannelKey {
+    fn of(meta: &SampleMeta) -> Self {
+        let SampleMeta { writer, layout, is_latched, .. } = *meta;
+        Self { writer: Some(writer), layout, is_latched }
+    }
 }
 
 /// The channel of a message.
@@ -161,7 +177,7 @@ impl UnfinishedClip {
             self.flush()?;
         }
         let ClipChannel { index, id: channel_id, new_bytes } =
-            self.channel(topic, Some(meta.writer))?;
+            self.channel(topic, ChannelKey::of(meta))?;
         let mut frame = std::mem::take(&mut self.frame);
         frame.clear();
         frame.extend_from_slice(&encapsulation(meta));
@@ -195,7 +211,7 @@ impl UnfinishedClip {
         if self.channels.by_topic.contains_key(&topic.name) {
             return Ok(());
         }
-        let channel = self.channel(topic, None)?;
+        let channel = self.channel(topic, ChannelKey::default())?;
         // Many topics with large definitions must not share one chunk.
         if channel.new_bytes > CHUNK_BYTES / 16 { self.flush() } else { Ok(()) }
     }
@@ -355,10 +371,9 @@ impl UnfinishedClip {
     fn channel(
         &mut self,
         topic: &TopicSchema,
-        writer: Option<Guid>,
+        mut key: ChannelKey,
     ) -> Result<ClipChannel, RecordError> {
         let is_full = self.channels.count >= CHANNELS_MAX;
-        let mut key = writer;
         if let Some(known) = self.channels.by_topic.get(&topic.name) {
             let channel_of = |key| {
                 known.by_writer.get(&key).map(|id| ClipChannel {
@@ -371,7 +386,7 @@ impl UnfinishedClip {
                 return Ok(found);
             }
             if is_full {
-                key = None;
+                key.writer = None;
                 if let Some(found) = channel_of(key) {
                     return Ok(found);
                 }
@@ -381,10 +396,13 @@ impl UnfinishedClip {
         if let Some(qos) = &topic.offered_qos {
             metadata.insert("offered_qos_profiles".to_owned(), qos.clone());
         }
-        if let Some(writer) = key {
+        if key.is_latched {
+            metadata.insert("gleaner.latched".to_owned(), "true".to_owned());
+        }
+        if let Some(writer) = key.writer {
             metadata.insert("gleaner.writer".to_owned(), writer.to_string());
         }
-        let definitions = topic.definitions.as_deref().unwrap_or_default();
+        let definitions = topic.layout(key.layout).map(Arc::as_ref).unwrap_or_default();
         let new_bytes =
             definitions.len() + topic.offered_qos.as_deref().map_or(0, str::len) + topic.name.len();
         let id = self.with_writer(|writer| {
@@ -396,6 +414,7 @@ impl UnfinishedClip {
         let known = self.channels.by_topic.entry(topic.name.clone()).or_insert_with(|| {
             TopicChannels { index: written.add_topic(topic), by_writer: HashMap::new() }
         });
+        written.add_definitions(known.index, definitions);
         known.by_writer.insert(key, id);
         self.channels.count += 1;
         Ok(ClipChannel { index: known.index, id, new_bytes: new_bytes as u64 })

@@ -1,7 +1,7 @@
 //! Counts and checksums of the messages in a clip, by topic: computed while it is written, and
 //! again when it is read.
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 
 use gleaner_messages::Endian;
 use gleaner_transport::SampleMeta;
@@ -13,13 +13,19 @@ use super::TopicSchema;
 pub(super) struct WrittenTopic {
     pub(super) name: String,
     pub(super) type_name: String,
-    /// CRC-32 of the definitions, in hexadecimal digits; `None` if the file has none.
-    pub(super) definitions: Option<String>,
+    /// CRC-32 of the definitions of each layout, in hexadecimal digits; empty if the file has none.
+    definitions: BTreeSet<String>,
     pub(super) messages: u64,
     checksum: u64,
 }
 
 impl WrittenTopic {
+    /// Returns the checksums of its definitions, sorted; `None` if the file has none.
+    pub(super) fn definitions(&self) -> Option<String> {
+        let texts: Vec<&str> = self.definitions.iter().map(String::as_str).collect();
+        (!texts.is_empty()).then(|| texts.join(", "))
+    }
+
     /// Returns the checksum over all messages, in hexadecimal digits.
     pub(super) fn checksum(&self) -> String {
         format!("{:016x}", self.checksum)
@@ -39,18 +45,23 @@ pub(super) struct Written {
 impl Written {
     /// Adds a topic, which is not there yet; returns its index.
     pub(super) fn add_topic(&mut self, topic: &TopicSchema) -> usize {
-        // Readers trim definitions.
-        let definitions =
-            topic.definitions.as_deref().map(str::trim).filter(|text| !text.is_empty());
         self.topics.push(WrittenTopic {
             name: topic.name.clone(),
             type_name: topic.type_name.clone(),
-            definitions: definitions.map(|text| crc32(text.as_bytes())),
             ..WrittenTopic::default()
         });
         let index = self.topics.len() - 1;
         self.by_name.insert(topic.name.clone(), index);
         index
+    }
+
+    /// Adds the definitions of a layout of the topic with this index.
+    pub(super) fn add_definitions(&mut self, topic: usize, text: &str) {
+        // Readers trim definitions.
+        let text = text.trim();
+        if !text.is_empty() {
+            self.topics[topic].definitions.insert(crc32(text.as_bytes()));
+        }
     }
 
     /// Counts a message of the topic with this index.
@@ -121,6 +132,8 @@ mod tests {
             seq: 3,
             endian: Endian::Little,
             options: [4, 5],
+            layout: 0,
+            is_latched: false,
         }
     }
 
@@ -128,16 +141,17 @@ mod tests {
     fn definitions_are_compared_without_surrounding_white_space() {
         let mut written = Written::default();
         for (name, text) in [("/a", "float64 x"), ("/b", "\nfloat64 x\n"), ("/c", " \n")] {
-            let (name, definitions) = (name.to_owned(), Some(text.into()));
-            written.add_topic(&TopicSchema {
-                name,
+            let topic = written.add_topic(&TopicSchema {
+                name: name.to_owned(),
                 type_name: "T".to_owned(),
-                definitions,
+                definitions: None,
                 offered_qos: None,
+                other_definitions: Vec::new(),
             });
+            written.add_definitions(topic, text);
         }
         let [a, b, c] = written.topics() else { panic!("three topics") };
-        assert_eq!((&a.definitions, &c.definitions), (&b.definitions, &None));
+        assert_eq!((a.definitions(), c.definitions()), (b.definitions(), None));
     }
 
     fn checksum_of(messages: &[(i64, &[u8])]) -> String {
@@ -147,6 +161,7 @@ mod tests {
             type_name: "T".to_owned(),
             definitions: None,
             offered_qos: None,
+            other_definitions: Vec::new(),
         };
         let topic = written.add_topic(&imu);
         messages.iter().for_each(|(at_ns, cdr)| written.count(topic, &meta(*at_ns), cdr));

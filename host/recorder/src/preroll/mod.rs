@@ -74,6 +74,8 @@ pub struct EntryMeta {
     pub options: [u8; 2],
     /// Byte order.
     pub is_big_endian: bool,
+    /// Number of the layout.
+    pub layout: u16,
 }
 
 impl EntryMeta {
@@ -89,6 +91,7 @@ impl EntryMeta {
             writer: meta.writer.0,
             options: meta.options,
             is_big_endian: meta.endian == Endian::Big,
+            layout: meta.layout,
         }
     }
 
@@ -104,6 +107,7 @@ impl EntryMeta {
             writer: [0; 16],
             options: [0; 2],
             is_big_endian: false,
+            layout: 0,
         }
     }
 
@@ -116,6 +120,8 @@ impl EntryMeta {
             seq: self.seq,
             endian: if self.is_big_endian { Endian::Big } else { Endian::Little },
             options: self.options,
+            layout: self.layout,
+            is_latched: false,
         }
     }
 }

@@ -169,6 +169,7 @@ const SOURCE: usize = 48;
 const LEN: usize = 52;
 const OPTIONS: usize = 56;
 const BIG: usize = 58;
+const LAYOUT: usize = 60;
 
 fn write_head(head: &mut [u8], held: &EntryMeta) {
     head[AT..][..8].copy_from_slice(&held.at_ns.to_le_bytes());
@@ -180,6 +181,7 @@ fn write_head(head: &mut [u8], held: &EntryMeta) {
     head[LEN..][..4].copy_from_slice(&held.len.to_le_bytes());
     head[OPTIONS..][..2].copy_from_slice(&held.options);
     head[BIG] = u8::from(held.is_big_endian);
+    head[LAYOUT..][..2].copy_from_slice(&held.layout.to_le_bytes());
 }
 
 fn read_head(head: &[u8]) -> EntryMeta {
@@ -193,6 +195,7 @@ fn read_head(head: &[u8]) -> EntryMeta {
         len: u32_at(head, LEN),
         options: bytes_at(head, OPTIONS),
         is_big_endian: head[BIG] != 0,
+        layout: u16::from_le_bytes(bytes_at(head, LAYOUT)),
     }
 }
 

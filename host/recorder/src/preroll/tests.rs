@@ -12,6 +12,8 @@ fn held(topic: usize, at: i64) -> EntryMeta {
         seq: at as u64 + 1,
         endian: if at % 2 == 0 { Endian::Little } else { Endian::Big },
         options: [0, at as u8],
+        layout: 0,
+        is_latched: false,
     };
     EntryMeta::sample(topic, &meta, 0)
 }

@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 use gleaner_feed::FedTopic;
-use gleaner_transport::{SampleMeta, StoredMeta, TopicCounters};
+use gleaner_transport::{SampleMeta, StoredMeta, TopicCounters, live_definitions};
 
 /// Attempts to find a sample that stays until it is looked at: the ingress publishes meanwhile.
 const ATTEMPTS: u32 = 8;
@@ -44,7 +44,11 @@ impl FedSamples {
     /// Returns the definitions to use: those of a recording, `local` ones, or those of nodes.
     pub fn definitions(&self, local: Option<Arc<str>>) -> Option<Arc<str>> {
         let carried = || self.fed.info.definitions.as_deref().map(Arc::from);
-        if self.fed.info.is_recorded { carried().or(local) } else { local.or_else(carried) }
+        let info = &self.fed.info;
+        if info.is_recorded {
+            return carried().or(local);
+        }
+        live_definitions(&info.type_name, info.type_hash.as_deref(), local, carried())
     }
 
     pub fn offered_qos(&self) -> Option<&str> {

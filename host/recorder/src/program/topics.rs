@@ -280,6 +280,7 @@ impl Topics {
             name: name.clone(),
             type_name,
             definitions: definitions.clone(),
+            other_definitions: Vec::new(),
             offered_qos: fed.samples.offered_qos().map(str::to_owned),
         };
         fed.description = Description::Settled;

@@ -5,6 +5,7 @@ use std::collections::VecDeque;
 use gleaner_transport::{Gaps, Guid, SampleMeta};
 
 use super::clips::OpenClip;
+use super::latched::{LatchRule, LatchedSample, LatchedTopic};
 use super::sources::RecordedSources;
 use crate::RecordError;
 use crate::preroll::{EntryMeta, Losses, Preroll};
@@ -48,6 +49,7 @@ struct TopicLosses {
     /// Each writer, with the stamp of its first sample after the last outage: its loss in the
     /// outage is known from that one.
     writers: Vec<(Guid, Option<i64>)>,
+    latched: LatchedTopic,
 }
 
 impl History {
@@ -137,7 +139,7 @@ impl History {
 
     /// Counts losses before a sample, from its sequence number.
     pub fn note_gap(&mut self, topic: usize, meta: &SampleMeta) {
-        let TopicLosses { losses, gaps, writers } = &mut self.topics[topic];
+        let TopicLosses { losses, gaps, writers, .. } = &mut self.topics[topic];
         let first = (meta.at_ns > self.noticed_at).then_some(meta.at_ns);
         match writers.iter_mut().find(|(writer, _)| *writer == meta.writer) {
             Some((_, known)) => *known = (*known).or(first),
@@ -155,6 +157,31 @@ impl History {
         } else if gaps.lost() < before {
             losses.lost.take_back();
         }
+    }
+
+    /// Keeps a sample of a latched topic, as long as it stays valid.
+    pub fn latch(&mut self, topic: usize, sample: LatchedSample, rule: LatchRule, horizon: i64) {
+        self.topics[topic].latched.keep(sample, rule, horizon);
+    }
+
+    /// Gives a clip the samples from before its begin that were still valid then.
+    pub fn begin_latched(
+        &self,
+        clip: &mut OpenClip,
+        group: &Group,
+        sources: &RecordedSources,
+    ) -> Result<(), RecordError> {
+        for topic in sources.topics_of(group) {
+            if let Some(rule) = sources.latch_rule(topic)
+                && clip.takes_latched(topic)
+            {
+                let from = clip.from(group);
+                let (samples, dropped) = self.topics[topic].latched.valid_at(from, rule);
+                clip.tally(topic).latched_dropped = dropped;
+                clip.latched(topic, samples, group, sources)?;
+            }
+        }
+        Ok(())
     }
 
     /// Notes that the ingress has ended at `at_ns` or later, or that another one was joined then.

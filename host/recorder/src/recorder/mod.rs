@@ -8,6 +8,7 @@
 
 mod clips;
 mod history;
+mod latched;
 mod limits;
 mod live;
 mod settings;
@@ -31,6 +32,7 @@ use crate::preroll::{EntryMeta, Preroll};
 use crate::window::{TriggerOutcome, WindowRules};
 use clips::Clips;
 use history::History;
+use latched::LatchedSample;
 use limits::RecorderLimits;
 use sources::RecordedSources;
 use writer::ClipDisk;
@@ -88,7 +90,7 @@ impl Recorder {
         let max_length_ns = nanoseconds(settings.max_length).max(1);
         Ok(Recorder {
             material: Material {
-                sources: RecordedSources::new(settings.clock.clone()),
+                sources: RecordedSources::new(settings.clock.clone(), is_live),
                 history: History::new(preroll, RecorderLimits::default().message_bytes),
             },
             clips: Clips::new(disk, max_length_ns, is_live),
@@ -121,6 +123,7 @@ impl Recorder {
             name: name.to_owned(),
             type_name: String::new(),
             definitions: None,
+            other_definitions: Vec::new(),
             offered_qos: None,
         };
         self.add_topic_state(topic, true)
@@ -189,9 +192,14 @@ impl Recorder {
             self.material.history.note_gap(topic, meta);
         }
         self.pass(meta.at_ns)?;
+        self.material.sources.saw(topic);
         // MCAP has no room for times before 1970.
         let meta = SampleMeta { publish_ns: meta.publish_ns.max(0), ..*meta };
         let in_group = self.clips.write(topic, &meta, cdr, &self.material)?;
+        if let Some(rule) = self.material.sources.latch_rule(topic) {
+            let horizon = self.clips.horizon();
+            self.material.history.latch(topic, LatchedSample::new(&meta, cdr), rule, horizon);
+        }
         self.material.history.keep(EntryMeta::sample(topic, &meta, in_group), cdr)
     }
 

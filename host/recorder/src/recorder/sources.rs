@@ -6,6 +6,7 @@ use gleaner_journal::{Encoder, JournalEntry, JournalHeader};
 use gleaner_lambda::ClipLambda;
 use gleaner_lambda::manifest::RecordSpec;
 
+use super::latched::{LatchRule, latched_depth};
 use super::settings::TopicId;
 use crate::file::TopicSchema;
 use crate::thumbnail::is_image;
@@ -40,7 +41,15 @@ struct SourceTopic {
     is_missing: bool,
     /// The time when it was found, if later than requested.
     found_at: Option<i64>,
+    /// True once it had a sample.
+    has_samples: bool,
+    /// The depth of its writers, if it is latched.
+    latched: Option<usize>,
     lambdas: Vec<usize>,
+}
+
+fn latched(schema: &TopicSchema) -> Option<usize> {
+    schema.offered_qos.as_deref().and_then(latched_depth)
 }
 
 /// One lambda, without its windows.
@@ -58,13 +67,15 @@ struct SourceLambda {
 pub struct RecordedSources {
     /// The clock of the stamps.
     clock: String,
+    /// True if its samples have writers.
+    is_live: bool,
     topics: Vec<SourceTopic>,
     lambdas: Vec<SourceLambda>,
 }
 
 impl RecordedSources {
-    pub fn new(clock: String) -> RecordedSources {
-        RecordedSources { clock, topics: Vec::new(), lambdas: Vec::new() }
+    pub fn new(clock: String, is_live: bool) -> RecordedSources {
+        RecordedSources { clock, is_live, topics: Vec::new(), lambdas: Vec::new() }
     }
 
     pub fn clock(&self) -> &str {
@@ -89,8 +100,16 @@ impl RecordedSources {
         if known + names(&schema) > NAMES_MAX {
             return Err(RecordError::LongNames { most: NAMES_MAX });
         }
+        let latched = latched(&schema);
         let (schema, lambdas) = (Arc::new(schema), Vec::new());
-        self.topics.push(SourceTopic { schema, is_missing, found_at: None, lambdas });
+        self.topics.push(SourceTopic {
+            schema,
+            is_missing,
+            found_at: None,
+            has_samples: false,
+            latched,
+            lambdas,
+        });
         Ok(self.topics.len() - 1)
     }
 
@@ -106,6 +125,7 @@ impl RecordedSources {
         if topic.is_missing {
             // Messages and windows use the name with which it was requested.
             topic.schema = Arc::new(TopicSchema { name: topic.schema.name.clone(), ..schema });
+            topic.latched = latched(&topic.schema);
             (topic.is_missing, topic.found_at) = (false, Some(since_ns));
         }
         Ok(())
@@ -156,6 +176,21 @@ impl RecordedSources {
 
     pub fn found_at(&self, topic: usize) -> Option<i64> {
         self.topics[topic].found_at
+    }
+
+    /// Notes that a topic has a sample.
+    pub fn saw(&mut self, topic: usize) {
+        self.topics[topic].has_samples = true;
+    }
+
+    /// Returns whether a topic ever had a sample.
+    pub fn has_seen(&self, topic: usize) -> bool {
+        self.topics[topic].has_samples
+    }
+
+    /// Returns how many samples of a latched topic stay valid; `None` for other topics.
+    pub fn latch_rule(&self, topic: usize) -> Option<LatchRule> {
+        self.topics[topic].latched.map(|depth| self.is_live.then_some(depth))
     }
 
     pub fn schema(&self, topic: usize) -> &Arc<TopicSchema> {

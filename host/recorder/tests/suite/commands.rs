@@ -142,7 +142,10 @@ fn a_stop_ends_what_a_command_started_and_nothing_else() {
             ("second", TriggerKind::Stop, "here", source)
         ]
     );
-    assert_eq!(clip.incomplete, ["first ended before its stop trigger"]);
+    assert_eq!(
+        clip.incomplete,
+        ["first ended before its stop trigger", "/b was not published before the clip ended"]
+    );
     commanded.accepted_and_refused(2, 2);
     commanded.end();
 }

@@ -6,7 +6,7 @@ use crate::support::*;
 use gleaner_base::Explain;
 use gleaner_lambda::TriggerKind::{Event, Start, Stop};
 use gleaner_protocol::RecordingCounts;
-use gleaner_recorder::{RecordError, RecordingFolder, TOPICS_MAX};
+use gleaner_recorder::{RecordError, RecordingFolder, TOPICS_MAX, TopicSchema};
 
 const EVENT: &[gleaner_lambda::TriggerKind] = &[Event];
 
@@ -44,12 +44,71 @@ fn a_clip_contains_exactly_its_window_and_describes_itself() {
         (missing.topic.as_str(), &missing.type_name, missing.received),
         ("/gone", &None, Some(0))
     );
-    assert_eq!(clip.incomplete, Vec::<String>::new());
+    assert_eq!(clip.incomplete, ["/gone was not published before the clip ended"]);
     let (header, wakes) = scratch.journal(clip, "hello");
     assert_eq!((header.wakes_before, wakes), (1, vec![T0 + 1136 * MS, T0 + 1200 * MS]));
     let counts = recorder.counts();
     let expected = RecordingCounts { clips: 1, windows: 1, ..RecordingCounts::default() };
     assert_eq!((counts.recording, counts.out_of_order), (expected, 0));
+}
+
+#[test]
+fn a_clip_begins_with_the_samples_of_latched_topics_that_were_valid_then() {
+    let scratch = TestDir::new();
+    let mut recorder = scratch.recorder(|_| {});
+    let a = recorder.add_topic(topic("/a")).unwrap();
+    let qos = "- history: keep_last\n  depth: 1\n  durability: transient_local\n".to_owned();
+    let latched = TopicSchema { offered_qos: Some(qos), ..topic("/tf_static") };
+    let latched = recorder.add_topic(latched).unwrap();
+    let lambda = recorder.add_lambda(member("hello", (500, 300, 0), &[a, latched]));
+    // Writers of a drive are unknown, so each earlier sample may still be valid.
+    for (topic, at_ms, seq) in [(latched, 0, 1), (latched, 10, 2), (latched, 2900, 3), (a, 3000, 1)]
+    {
+        recorder.sample(topic, &meta(T0 + at_ms * MS, seq), b"12345678").unwrap();
+    }
+    recorder.wake(lambda, &entry(T0 + 3000 * MS, EVENT)).unwrap();
+    recorder.sample(a, &meta(T0 + 9000 * MS, 2), b"12345678").unwrap();
+    recorder.wake(lambda, &entry(T0 + 9000 * MS, EVENT)).unwrap();
+    recorder.finish(T0 + 10_000 * MS).unwrap();
+    let of_tf = |clip: &gleaner_lambda::Clip| -> Vec<_> {
+        let contents = scratch.contents(clip).into_iter();
+        contents.filter(|(topic, ..)| topic == "/tf_static").map(|(_, at, seq)| (at, seq)).collect()
+    };
+    let [first, second] = recorder.clips() else { panic!("two clips") };
+    let at = |ms: i64| T0 + ms * MS;
+    assert_eq!(of_tf(first), [(at(2500), 1), (at(2500), 2), (at(2900), 3)]);
+    assert_eq!(of_tf(second), [(at(8500), 1), (at(8500), 2), (at(8500), 3)]);
+    for clip in [first, second] {
+        assert!(clip.incomplete.is_empty() && clip.topics[1].received == Some(3), "{clip:?}");
+        // Only the first of them has a message of its own time.
+        assert_eq!(scratch.channels(clip).len(), if clip == first { 3 } else { 2 });
+    }
+    let path = scratch.0.join(&first.file);
+    let mut drive = gleaner_drives::Replay::open(&[path]).unwrap();
+    let sink = std::sync::Arc::new(Ignored);
+    for topic in gleaner_transport::Transport::topics(&drive) {
+        let spec = gleaner_transport::TopicSpec {
+            topic: topic.topic,
+            type_name: topic.type_name,
+            queue: 1,
+            max_bytes: 8,
+            qos: Default::default(),
+        };
+        gleaner_transport::Transport::subscribe(&mut drive, &spec, sink.clone()).unwrap();
+    }
+    let mut latched = Vec::new();
+    while let Some(step) = drive.step().unwrap() {
+        latched.extend(step.meta.is_latched.then_some((step.meta.publish_ns, step.meta.seq)));
+    }
+    assert_eq!(latched, [(at(0), 1), (at(10), 2)]);
+}
+
+struct Ignored;
+
+impl gleaner_transport::Sink for Ignored {
+    fn deliver(&self, _: &gleaner_transport::SampleMeta, _: &[u8]) -> gleaner_transport::Delivery {
+        gleaner_transport::Delivery::Taken
+    }
 }
 
 #[test]

@@ -66,7 +66,7 @@ fn region(bytes: u64) -> OwnedFd {
 
 fn opened() -> Sent {
     let (inputs, outputs, runtime) = (Vec::new(), Vec::new(), "rten".to_owned());
-    Sent::Result(Ok(ModelResult::Opened { inputs, outputs, runtime }), None)
+    Sent::Result(Ok(ModelResult::Opened { inputs, outputs, runtime, metadata: Vec::new() }), None)
 }
 
 fn reserved() -> Sent {
@@ -211,7 +211,10 @@ fn a_start_of_the_process_without_its_end_makes_the_lambda_open_its_models_again
 fn the_runtimes_that_are_stated_are_those_of_all_processes() {
     let runs_on = |runtime: &str| {
         let (inputs, outputs, runtime) = (Vec::new(), Vec::new(), runtime.to_owned());
-        Sent::Result(Ok(ModelResult::Opened { inputs, outputs, runtime }), None)
+        Sent::Result(
+            Ok(ModelResult::Opened { inputs, outputs, runtime, metadata: Vec::new() }),
+            None,
+        )
     };
     let unloadable = fault(ModelFaultKind::Failed);
     let (models, serving) =

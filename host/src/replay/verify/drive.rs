@@ -161,9 +161,8 @@ fn at_seconds(at_ns: i64, start_ns: i64) -> String {
 }
 
 fn damaged(error: gleaner_drives::ReplayError, wakes: u64) -> Failure {
-    let help = format!(
-        "the {wakes} decisions before the damage are the same; copy the file again if you can"
-    );
+    let why = error.help().map(|help| format!("; {help}")).unwrap_or_default();
+    let help = format!("the {wakes} decisions before the damage are the same{why}");
     Failure::from(DriveError(error)).with_help(help)
 }
 

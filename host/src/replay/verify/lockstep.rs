@@ -95,6 +95,10 @@ impl LockstepSink {
 
 impl Sink for LockstepSink {
     fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Delivery {
+        // A clip has it beside the samples that the lambda saw.
+        if meta.is_latched {
+            return Delivery::Taken;
+        }
         let mut state = self.lock();
         if state.owed > 0 {
             state.owed -= 1;

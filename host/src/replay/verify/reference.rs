@@ -177,6 +177,8 @@ impl ReferenceJournal {
         Ok(ReplayOptions {
             lambda,
             drives,
+            // They are those of the journal.
+            merge: true,
             range,
             topics: Vec::new(),
             unpack_in: None,

@@ -78,6 +78,7 @@ fn ultralytics_gives_centre_and_size() {
 fn only_wanted_classes_are_read() {
     let rows = [
         [32.0, 32.0, 16.0, 8.0, 0.9, 0.5, 0.4],
+        // Only what is read must be a score.
         [10.0, 40.0, 4.0, 4.0, f32::NAN, 0.0, 0.3],
         [20.0, 40.0, 4.0, 4.0, 0.9, 0.0, 0.0],
     ];
@@ -165,16 +166,45 @@ fn numbers_that_are_not_finite_are_dropped() {
             rows.push(row);
         }
     }
-    rows.push([32.0, 32.0, 4.0, 4.0, f32::INFINITY, 0.0, 0.0]);
-    rows.push([32.0, 32.0, 4.0, 4.0, f32::NAN, f32::NAN, f32::NAN]);
     assert_eq!(run_ultralytics(&rows, &all()), []);
-    rows.push([32.0, 32.0, 4.0, 4.0, 7.0, f32::NAN, 0.0]);
-    let found = run_ultralytics(&rows, &Wanted { min_score: 0.0, ..all() });
-    // A score is at most 1.
-    assert_eq!((found[0].score, found[0].x), (1.0, 60.0));
-    assert!(found.iter().all(|found| {
-        [found.score, found.x, found.y, found.width, found.height].iter().all(|n| n.is_finite())
-    }));
+}
+
+#[test]
+fn a_number_that_is_no_score_is_a_fault_with_its_value() {
+    for value in [f32::NAN, f32::INFINITY, 1.000_001, 7.0, -0.25] {
+        let (by_number, by_anchor) = ultralytics(&[[32.0, 32.0, 4.0, 4.0, 0.9, value, 0.0]]);
+        let yolox = [&[0.5, 0.5, 0.0, 0.0, 0.9, value, 0.0], &[0.0; 83 * 7][..]].concat();
+        let objectness = [&[0.5, 0.5, 0.0, 0.0, value, 0.0, 0.0], &[0.0; 83 * 7][..]].concat();
+        let nms_free = [10.0, 20.0, 30.0, 40.0, value, 0.0];
+        let nanodet = [&[value, 0.0], &[0.0; 84 * 34 - 2][..]].concat();
+        for (layout, shape, values) in [
+            (DetectorLayout::Ultralytics, [1, 7, 84], &by_number[..]),
+            (DetectorLayout::Ultralytics, [1, 84, 7], &by_anchor),
+            (DetectorLayout::Yolox, [1, 84, 7], &yolox),
+            (DetectorLayout::Yolox, [1, 84, 7], &objectness),
+            (DetectorLayout::NmsFree, [1, 1, 6], &nms_free),
+            (DetectorLayout::Nanodet, [1, 84, 34], &nanodet),
+        ] {
+            let message = run(layout, &shape, values, &all()).unwrap_err().to_string();
+            let expected = format!("the model returned {value} as a score of layout `");
+            assert!(message.starts_with(&expected), "{message}");
+        }
+    }
+}
+
+#[test]
+fn boxes_that_are_not_in_pixels_are_a_fault() {
+    // RT-DETR: centre and size from 0 to 1, as fractions of the input.
+    let rows = [[0.5, 0.5, 0.2, 0.1, 0.9, 2.0], [0.0, 0.0, 0.0, 0.0, 0.0, 0.0]];
+    let shape = [1, 2, 6];
+    let run = |rows: &[[f32; 6]; 2], min_score| {
+        let wanted = Wanted { min_score, ..all() };
+        run(DetectorLayout::NmsFree, &shape, rows.as_flattened(), &wanted)
+    };
+    let message = run(&rows, 0.25).unwrap_err().to_string();
+    assert!(message.starts_with("all boxes that the model returned end below 2 pixels"));
+    assert_eq!(run(&rows, 0.95), Ok(vec![]), "no object");
+    assert_eq!(run(&[[0.0; 6]; 2], 0.0), Ok(vec![]), "padding");
 }
 
 #[test]
@@ -269,11 +299,12 @@ fn outputs_that_do_not_fit_are_refused_with_both_shapes() {
     );
     assert!(refusal(DetectorLayout::NmsFree, &[1, 300, 7], 2100).contains("[1, rows, 6]"));
     assert!(refusal(DetectorLayout::Ultralytics, &[0, 0, 0], 0).contains("[0, 0, 0]"));
+    assert!(refusal(DetectorLayout::Ultralytics, &[1, 300, 90], 27_000).contains("[1, 300, 90]"));
     assert_eq!(
-        refusal(DetectorLayout::Ultralytics, &[1, 84, 8400], 84 * 8400 - 1),
-        "output [1, 84, 8400] of the model has 705599 values"
+        refusal(DetectorLayout::Ultralytics, &[1, 80, 84], 80 * 84 - 1),
+        "output [1, 80, 84] of the model has 6719 values"
     );
-    for shape in [[1, u32::MAX, u32::MAX], [1, 1 << 31, 1 << 31], [1, 1 << 20, 5]] {
+    for shape in [[1, u32::MAX, 84], [1, 84, 1 << 31], [1, 84, 5]] {
         assert!(refusal(DetectorLayout::Ultralytics, &shape, 12).ends_with("has 12 values"));
     }
     let error = detect(DetectorLayout::Yolox, &[], &PLACED, &all()).unwrap_err().to_string();
@@ -318,16 +349,10 @@ fn of_many_objects_only_the_best_are_compared() {
     assert_eq!(found[0].score, values[(count - 1) * 6 + 4]);
     assert!(found.is_sorted_by(|a, b| a.score >= b.score));
     // The one in another place has a low score, and is not among the best.
-    let mut values = vec![0.0; 5 * count];
-    for at in 0..count {
-        let last = at == count - 1;
-        let centre = if last { 50.0 } else { 20.0 };
-        let numbers = [centre, 32.0, 4.0, 4.0, if last { 0.3 } else { 0.9 }];
-        for (number, value) in numbers.into_iter().enumerate() {
-            values[number * count + at] = value;
-        }
+    for row in values.chunks_exact_mut(6) {
+        row[4] = 0.9;
     }
-    let shape = [1, 5, count as u32];
-    let found = run(DetectorLayout::Ultralytics, &shape, &values, &wanted).unwrap();
-    assert_eq!(found.len(), 1);
+    values[(count - 1) * 6..].copy_from_slice(&[50.0, 20.0, 60.0, 40.0, 0.3, 1.0]);
+    let found = run(DetectorLayout::NmsFree, &shape, &values, &wanted).unwrap();
+    assert!(found.iter().all(|found| found.class == 0));
 }

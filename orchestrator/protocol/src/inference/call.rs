@@ -68,6 +68,9 @@ pub enum ModelResult {
         outputs: Vec<TensorInfo>,
         /// Backend, version, provider and threads, such as `rten 0.27.0, cpu, 1 thread`.
         runtime: String,
+        /// Entries of its metadata that describe a detector, by key.
+        #[serde(default)]
+        metadata: Vec<(String, String)>,
     },
     /// The region for inputs, which comes as a descriptor.
     Reserved,

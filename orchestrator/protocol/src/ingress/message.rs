@@ -54,6 +54,9 @@ pub struct AttachedTopic {
     pub refused: u64,
     /// ros2msg text of the type and all types it refers to, if the source carries it.
     pub definitions: Option<String>,
+    /// Hash (RIHS01) of the layout that is received, if the topic's writers announce one.
+    #[serde(default)]
+    pub type_hash: Option<String>,
     /// True if the samples are those of a recording: its definitions are preferred to any other.
     #[serde(default)]
     pub is_recorded: bool,

@@ -236,6 +236,7 @@ fn attached(definitions: usize) -> ReaderMessage {
         digests: 3,
         refused: 4,
         definitions: Some("x".repeat(definitions)),
+        type_hash: None,
         is_recorded: false,
         offered_qos: None,
     }))

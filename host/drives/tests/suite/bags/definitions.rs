@@ -64,6 +64,30 @@ fn the_file_comes_before_the_lambda_and_the_lambda_before_ros_2() {
 }
 
 #[test]
+fn a_topic_of_a_database_has_the_definition_with_its_hash() {
+    let ty = crate::support::TYPE;
+    let (_folder, path) = database(ty, Some(("ros2msg", "int64 old")));
+    let db = rusqlite::Connection::open(&path).unwrap();
+    add_text(&db, ty, "ros2msg", "int64 new");
+    let finds = |topic: &str, definition: &str| {
+        db.execute("UPDATE topics SET type_description_hash = ?1", [topic]).unwrap();
+        let hash = "UPDATE message_definitions SET type_description_hash = ?1 \
+                    WHERE encoded_message_definition LIKE '% new'";
+        db.execute(hash, [definition]).unwrap();
+        let replay = open(path.clone(), None);
+        replay
+            .can_subscribe(&spec("/a"))
+            .map(|()| replay.definitions("/a").unwrap().fields().next().unwrap().to_owned())
+    };
+    assert_eq!(finds("RIHS01_new", "RIHS01_new").unwrap(), "new");
+    // Two definitions, and no word on which one is meant.
+    for topic in ["", "RIHS01_other"] {
+        let refused = finds(topic, "RIHS01_new").unwrap_err();
+        assert!(matches!(refused, TransportError::UnknownLayout { .. }), "{refused}");
+    }
+}
+
+#[test]
 fn a_text_in_idl_is_refused_unless_there_is_another() {
     let ty = crate::support::TYPE;
     let (_folder, path) = database(ty, Some(("ros2idl", "module test_msgs {};")));

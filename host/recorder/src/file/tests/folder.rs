@@ -231,6 +231,7 @@ fn the_longest_possible_line_can_be_read_again() {
         type_name: name(n),
         definitions: None,
         offered_qos: None,
+        other_definitions: Vec::new(),
     };
     assert!(topic(1).check().is_ok());
     let counts = |n| ClipTopicCounts {

@@ -95,12 +95,19 @@ fn imu() -> TopicSchema {
         type_name: "sensor_msgs/msg/Imu".to_owned(),
         definitions: Some("float64 x".into()),
         offered_qos: Some("- history: 3".to_owned()),
+        other_definitions: Vec::new(),
     }
 }
 
 fn camera() -> TopicSchema {
     let (name, type_name) = ("/camera".to_owned(), "sensor_msgs/msg/Image".to_owned());
-    TopicSchema { name, type_name, definitions: None, offered_qos: None }
+    TopicSchema {
+        name,
+        type_name,
+        definitions: None,
+        offered_qos: None,
+        other_definitions: Vec::new(),
+    }
 }
 
 fn meta(at_ns: i64, seq: u64) -> SampleMeta {
@@ -112,6 +119,8 @@ fn meta(at_ns: i64, seq: u64) -> SampleMeta {
         seq,
         endian: Endian::Little,
         options: [0; 2],
+        layout: 0,
+        is_latched: false,
     }
 }
 

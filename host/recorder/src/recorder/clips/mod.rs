@@ -59,6 +59,11 @@ impl Clips {
         self.windows.add(rules)
     }
 
+    /// Returns the instant before which no clip will begin.
+    pub fn horizon(&self) -> i64 {
+        self.windows.horizon()
+    }
+
     pub fn is_held(&self) -> bool {
         self.held.is_some()
     }

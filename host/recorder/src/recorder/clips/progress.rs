@@ -411,6 +411,7 @@ fn backfill(
     let Material { sources, history } = material;
     windows.iter().for_each(|window| history.reach_back(clip, window, sources));
     history.count_losses(clip, group, sources, limit);
+    history.begin_latched(clip, group, sources)?;
     Backfill::new(clip, group, windows, limit, fresh_from, sources)
 }
 

@@ -62,6 +62,8 @@ impl FakeNetwork {
             definitions_text,
             messages: None,
             offered_qos: None,
+            type_hash: None,
+            other_definitions: Vec::new(),
         };
         self.others.lock().unwrap().push(other);
     }

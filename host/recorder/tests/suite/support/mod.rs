@@ -134,6 +134,7 @@ pub fn topic(name: &str) -> TopicSchema {
         type_name: type_name.to_owned(),
         definitions: Some("int64 value\n".into()),
         offered_qos: None,
+        other_definitions: Vec::new(),
     }
 }
 
@@ -197,6 +198,8 @@ pub fn meta(at_ns: i64, seq: u64) -> SampleMeta {
         seq,
         endian: Endian::Little,
         options: [0; 2],
+        layout: 0,
+        is_latched: false,
     }
 }
 

@@ -15,6 +15,7 @@ use self::tally::TopicTally;
 use crate::RecordError;
 use crate::file::{CONTINUES, ClipHeader, ClipTrailer, names};
 use crate::preroll::{EntryMeta, Walked};
+use crate::recorder::latched::LatchedSample;
 use crate::recorder::limits::RecorderLimits;
 use crate::recorder::sources::RecordedSources;
 use crate::recorder::writer::{ClipCompletion, ClipSample, ClipWriter};
@@ -70,6 +71,9 @@ pub struct OpenClip {
     tallies: Vec<TopicTally>,
     moments: Vec<Moment>,
     journals: ClipJournals,
+    /// Topics that it has the latched samples of, and those of them that are not written yet.
+    latched_topics: Vec<usize>,
+    latched: Vec<(usize, LatchedSample)>,
 }
 
 impl OpenClip {
@@ -99,6 +103,8 @@ impl OpenClip {
             tallies: Vec::new(),
             moments: Vec::new(),
             journals: ClipJournals::new(limits),
+            latched_topics: Vec::new(),
+            latched: Vec::new(),
         }
     }
 
@@ -261,6 +267,43 @@ impl OpenClip {
         Ok(())
     }
 
+    /// Returns whether it has no latched samples of a topic yet; asked once.
+    pub fn takes_latched(&mut self, topic: usize) -> bool {
+        let is_new = !self.latched_topics.contains(&topic);
+        if is_new {
+            self.latched_topics.push(topic);
+        }
+        is_new
+    }
+
+    /// Takes samples from before its begin. Alone, they are no reason for a clip.
+    pub fn latched(
+        &mut self,
+        topic: usize,
+        samples: Vec<LatchedSample>,
+        group: &Group,
+        sources: &RecordedSources,
+    ) -> Result<(), RecordError> {
+        self.latched.extend(samples.into_iter().map(|sample| (topic, sample)));
+        if self.is_begun { self.write_latched(group, sources) } else { Ok(()) }
+    }
+
+    /// Writes latched samples with the time of its begin; their publish times stay.
+    fn write_latched(
+        &mut self,
+        group: &Group,
+        sources: &RecordedSources,
+    ) -> Result<(), RecordError> {
+        let at_ns = self.from(group);
+        for (topic, LatchedSample { meta, cdr }) in std::mem::take(&mut self.latched) {
+            let meta = SampleMeta { at_ns, is_latched: true, ..meta };
+            let schema = sources.schema(topic);
+            self.writer.write(ClipSample { topic, schema, meta: &meta, cdr: &cdr })?;
+            self.tally(topic).messages += 1;
+        }
+        Ok(())
+    }
+
     /// Sends messages that its writer has collected.
     pub fn flush(&mut self) -> Result<(), RecordError> {
         self.writer.flush()
@@ -277,7 +320,8 @@ impl OpenClip {
             lambdas: sources.lambdas_of(group),
             moment: self.opening.clone(),
         };
-        self.writer.begin(clip_name(&self.opening.lambda, self.opening.at_ns), header)
+        self.writer.begin(clip_name(&self.opening.lambda, self.opening.at_ns), header)?;
+        self.write_latched(group, sources)
     }
 
     /// Completes the file; returns the clip if that is done already. `uncertain` are lambdas with

@@ -17,6 +17,8 @@ pub struct TopicTally {
     huge: u64,
     /// True if a window reaches further back than the preroll.
     pub is_aged: bool,
+    /// Latched samples that were not kept.
+    pub latched_dropped: u64,
 }
 
 impl Default for TopicTally {
@@ -28,6 +30,7 @@ impl Default for TopicTally {
             lost: None,
             huge: 0,
             is_aged: false,
+            latched_dropped: 0,
         }
     }
 }
@@ -49,7 +52,8 @@ impl TopicTally {
         most: usize,
         short: &mut Vec<String>,
     ) -> ClipTopicCounts {
-        let TopicTally { messages, overwritten, too_big, lost, huge, is_aged } = *self;
+        let TopicTally { messages, overwritten, too_big, lost, huge, is_aged, latched_dropped } =
+            *self;
         let schema = sources.schema(topic);
         let name = &schema.name;
         match overwritten {
@@ -89,6 +93,13 @@ impl TopicTally {
         }
         if is_aged {
             short.push(format!("a trigger came late: samples of {name} had left the preroll"));
+        }
+        if latched_dropped > 0 {
+            let samples = plural(latched_dropped, "earlier sample");
+            short.push(format!("{name} is latched: {samples} of it found no room"));
+        }
+        if !sources.has_seen(topic) {
+            short.push(format!("{name} was not published before the clip ended"));
         }
         let late = sources.found_at(topic).map(|at| at.saturating_sub(from));
         if let Some(late) = late.filter(|late| *late > 0) {

@@ -1,0 +1,179 @@
+//! Drives with odd content, as in public bug reports: each value is right, or it is refused.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use gleaner_tests::{LambdaCopy, ReplayRun, TempFolder, replay_to, root, verify_clip};
+use libtest_mimic::{Failed, Trial};
+
+use crate::clips::{python, same};
+
+/// Logs the fields of `config.fields` of each sample.
+const READER: &str = r#"
+class Lambda:
+    def __init__(self, ctx):
+        self.fields = [ctx.input("imu").field(path) for path in ctx.config["fields"].split()]
+
+    def on_event(self, ctx, event):
+        ctx.event("read", 1.0, values=" ".join(str(event.get(field)) for field in self.fields))
+"#;
+
+pub fn trials() -> Vec<Trial> {
+    let mut trials = vec![
+        Trial::test("messages_of_two_layouts_are_read_each_by_its_own", two_layouts),
+        Trial::test("a_field_that_only_one_layout_has_is_refused_with_both", differing_field),
+        Trial::test("one_odd_message_or_topic_costs_no_other", odd_topics),
+        Trial::test("an_empty_file_of_a_recording_is_skipped", empty_file),
+        Trial::test("two_drives_of_one_time_are_refused_unless_merged", two_drives),
+    ];
+    let name = "foreign_readers_find_the_values_of_the_drive_in_clips_of_odd_drives";
+    trials.push(match python() {
+        Ok(python) => Trial::test(name, move || foreign(&python)),
+        Err(why) => Trial::test(format!("{name} [{why}]"), || Ok(())).with_ignored_flag(true),
+    });
+    trials
+}
+
+fn case(name: &str) -> PathBuf {
+    root().join("tests/data/cases").join(name)
+}
+
+/// A lambda that reads `fields` of `topic`, and records all topics of the drive.
+fn reader(topic: &str, type_name: &str, fields: &str) -> LambdaCopy {
+    let lambda = LambdaCopy::of("examples/hello/python", |manifest| {
+        let manifest = manifest
+            .replace(
+                "\"/imu/data\"\ntype = \"sensor_msgs/msg/Imu\"",
+                &format!("\"{topic}\"\ntype = \"{type_name}\""),
+            )
+            .replace("deadline = \"10ms\"\n", "");
+        let (before, _) = manifest.split_once("[config]").unwrap_or((&manifest, ""));
+        format!("{before}[config]\nfields = \"{fields}\"\n")
+    });
+    lambda.replace("main.py", READER);
+    lambda
+}
+
+/// Replays drives with a reader, and clips of all topics.
+fn read(lambda: &LambdaCopy, drives: &[PathBuf]) -> (TempFolder, ReplayRun) {
+    let out = TempFolder::new();
+    let run = replay_to(out.path(), lambda.path(), drives, &["--topics", "*"]);
+    (out, run)
+}
+
+fn values(run: &ReplayRun) -> Vec<String> {
+    let triggers = run.decisions.iter().flat_map(|decision| &decision.triggers);
+    triggers
+        .flat_map(|trigger| trigger.attributes.iter())
+        .map(|(_, value)| serde_json::to_value(value).unwrap_or_default())
+        .map(|value| value.as_str().map_or_else(|| value.to_string(), str::to_owned))
+        .collect()
+}
+
+const WHEELS: (&str, &str) = ("/wheels", "car_msgs/msg/WheelSpeeds");
+
+fn two_layouts() -> Result<(), Failed> {
+    // The foreign readers give 10 to 19 and 20 to 29 for these drives.
+    let expected: Vec<_> = (0..10).map(|n| format!("{}.0 {}.0", 10 + n, 20 + n)).collect();
+    let lambda = reader(WHEELS.0, WHEELS.1, "front_left front_right");
+    let both = [case("01b_new.mcap"), case("01b_old.mcap")];
+    let turned = [case("01b_old.mcap"), case("01b_new.mcap")];
+    for drives in [
+        &[case("01a_two_definitions_one_file.mcap")][..],
+        &[case("01c_same_layout_other_comments.mcap")],
+        &both,
+        &turned,
+    ] {
+        let (out, run) = read(&lambda, drives);
+        same(&(run.exit, values(&run)), &(0, expected.clone()))?;
+        // A clip is a drive with two layouts, too.
+        for clip in &run.clips {
+            let verified = verify_clip(&out.path().join(&clip.file), lambda.path());
+            same(&(verified.exit, verified.stderr.as_str()), &(0, ""))?;
+        }
+    }
+    Ok(())
+}
+
+fn differing_field() -> Result<(), Failed> {
+    let lambda = reader(WHEELS.0, WHEELS.1, "status");
+    let (_out, run) = read(&lambda, &[case("01a_two_definitions_one_file.mcap")]);
+    let expected = "`status` does not mean the same in all layouts of `car_msgs/msg/WheelSpeeds` on \
+                    this topic: in that with the fields `front_left`, `front_right`, ";
+    same(&(run.exit, run.stderr.contains(expected)), &(6, true))
+}
+
+fn odd_topics() -> Result<(), Failed> {
+    let x = "linear_acceleration.x";
+    for (drive, malformed, named) in [
+        ("02_two_types_one_topic", None, "left_out=std_msgs/msg/Float64"),
+        ("08b_zero_length_message", Some("/text"), "it begins with []"),
+        ("18_pl_cdr", Some("/x"), "it begins with [00, 03, 00, 00]"),
+        ("18_xcdr2_delimited", Some("/x"), "it begins with [00, 09, 00, 00]"),
+        ("18_xcdr2_plain", Some("/x"), "it begins with [00, 07, 00, 00]"),
+        ("14_service_events_raw_srv_schema", None, ""),
+        ("15_ros2idl", None, "/control/lateral"),
+    ] {
+        let lambda = reader("/imu", "sensor_msgs/msg/Imu", x);
+        let (_out, run) = read(&lambda, &[case(drive).with_extension("mcap")]);
+        let summary = run.summary.as_ref().ok_or_else(|| format!("{drive}: {}", run.stderr))?;
+        let odd: Vec<_> = summary.malformed.keys().map(String::as_str).collect();
+        same(
+            &(drive, run.exit, values(&run).len(), odd, run.stderr.contains(named)),
+            &(drive, 0, 10, malformed.into_iter().collect(), true),
+        )?;
+    }
+    Ok(())
+}
+
+fn empty_file() -> Result<(), Failed> {
+    let lambda = reader("/imu", "sensor_msgs/msg/Imu", "linear_acceleration.x");
+    let (_out, run) = read(&lambda, &[case("split_zero_byte_last")]);
+    let is_named = run.stderr.contains("s_1.mcap");
+    same(&(run.exit, values(&run).len(), is_named), &(0, 20, true))?;
+    let (_out, run) = read(&lambda, &[case("split_zero_byte_last/s_1.mcap")]);
+    same(&(run.exit, run.stderr.contains("s_1.mcap` is empty: its recorder")), &(2, true))
+}
+
+fn two_drives() -> Result<(), Failed> {
+    let lambda = reader("/imu", "sensor_msgs/msg/Imu", "linear_acceleration.x");
+    let drives = [case("15_ros2idl.mcap"), case("18_pl_cdr.mcap")];
+    let out = TempFolder::new();
+    // They last 0.9 s: less than what may be the border of two files.
+    let run = replay_to(out.path(), lambda.path(), &drives, &["--no-record"]);
+    same(&(run.exit, values(&run).len()), &(0, 20))?;
+    let sample = gleaner_tests::sample_drive();
+    let copy = out.write("copy.mcap", std::fs::read(&sample)?);
+    let hello = root().join("examples/hello/rust");
+    let run = replay_to(out.path(), &hello, &[sample.clone(), copy.clone()], &[]);
+    same(&(run.exit, run.stderr.contains("pass --merge")), &(2, true))?;
+    same(&replay_to(out.path(), &hello, &[sample, copy], &["--merge"]).exit, &0)
+}
+
+fn foreign(python: &Path) -> Result<(), Failed> {
+    for (drive, topic, type_name, field) in [
+        ("01a_two_definitions_one_file", WHEELS.0, WHEELS.1, "front_left"),
+        ("01c_same_layout_other_comments", WHEELS.0, WHEELS.1, "front_left"),
+        ("02_two_types_one_topic", "/imu", "sensor_msgs/msg/Imu", "linear_acceleration.x"),
+        ("08b_zero_length_message", "/imu", "sensor_msgs/msg/Imu", "linear_acceleration.x"),
+    ] {
+        let drive = case(drive).with_extension("mcap");
+        let (out, run) = read(&reader(topic, type_name, field), std::slice::from_ref(&drive));
+        same(&run.clips.is_empty(), &false)?;
+        for clip in &run.clips {
+            same_values(python, &drive, &out.path().join(&clip.file))?;
+        }
+    }
+    Ok(())
+}
+
+/// Third-party readers decode the messages of the clip to the values that they have in the drive.
+pub fn same_values(python: &Path, drive: &Path, clip: &Path) -> Result<(), Failed> {
+    let mut reader = Command::new(python);
+    reader.arg("-I").arg(root().join("tests/readers/values.py")).args([drive, clip]);
+    let output = reader.output()?;
+    match output.status.success() {
+        true => Ok(()),
+        false => Err(String::from_utf8_lossy(&output.stderr).into_owned().into()),
+    }
+}
