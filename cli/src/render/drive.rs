@@ -294,12 +294,7 @@ depth = 128                 # 1.3 s
         };
         let text = drive(&drive_of_parts);
         assert!(text.contains("from 0.0 to 0.5 s; --all reads the whole drive\n"), "{text}");
-        assert!(
-            text.contains(
-                "cut\\u{1b} off\n2 messages out of order"
-            ),
-            "{text}"
-        );
+        assert!(text.contains("cut\\u{1b} off\n2 messages out of order"), "{text}");
         assert!(text.ends_with("\nand 61,439 more topics, not read\n"), "{text}");
     }
 }
