@@ -40,11 +40,9 @@ pub fn all() -> Vec<Vec<u8>> {
     for (colour, channels) in
         [(Png::Grayscale, 1), (Png::GrayscaleAlpha, 2), (Png::Rgb, 3), (Png::Rgba, 4)]
     {
-        seeds.extend(
-            [(BitDepth::Eight, 1), (BitDepth::Sixteen, 2)]
-                .map(|(depth, bytes)| png(colour, depth, channels * bytes)),
-        );
+        seeds.push(png(colour, BitDepth::Eight, channels));
     }
+    seeds.push(png(Png::Grayscale, BitDepth::Sixteen, 2));
     seeds.push(png(Png::Indexed, BitDepth::Eight, 1));
     seeds.extend((0..ENCODINGS.len()).map(raw));
     seeds

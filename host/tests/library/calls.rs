@@ -113,7 +113,7 @@ impl HostedData {
             Operation::Histogram => frame.histogram(None).map(drop),
             Operation::Resize => frame.resize(640, 480).map(drop),
             Operation::ToGray => frame.to_gray().map(drop),
-            Operation::Read => frame.read(0, u32::MAX).map(drop),
+            Operation::Read => frame.read(0, 1 << 20).map(drop),
             Operation::Event => answered(session.event("e", 1.0, Vec::new())),
             Operation::Start => answered(session.start("s", Vec::new())),
             Operation::Stop => answered(session.stop("s")),
