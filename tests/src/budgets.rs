@@ -11,7 +11,7 @@ pub const LINES: &[(&str, usize, usize)] = &[
     ("cli", 10266, 4034),
     ("cloud", 18228, 5697),
     ("examples", 1318, 757),
-    ("fuzz", 4204, 86),
+    ("fuzz", 4216, 86),
     ("guest-sdk-python", 5875, 4098),
     ("guest-sdk-rust", 5687, 1621),
     ("host", 61915, 30800),

@@ -139,6 +139,17 @@ fn requests() -> Vec<ModelRequest> {
     numbered.map(request).collect()
 }
 
+/// Returns an element of an output: boxes in pixels, scores from 0 to 1.
+fn value_at(layout: u8, shape: [u32; 3], at: usize) -> f32 {
+    let is_transposed = layout == 0 && shape[1] == 6;
+    let column = if is_transposed { at / shape[2] as usize } else { at % shape[2] as usize };
+    match layout {
+        2 => [1.0, 2.0, 20.0, 24.0, 0.75, 0.0][column],
+        0 | 1 if column < 4 => [9.0, 8.0, 6.0, 5.0][column],
+        _ => [0.75, 0.0, 0.5, 0.875, 1.0][at % 5],
+    }
+}
+
 /// Outputs of a detector whose input has 32x32 pixels, and 21 cells with strides 8, 16 and 32.
 fn outputs() -> Vec<Vec<u8>> {
     let shapes: [(u8, [u32; 3]); 7] = [
@@ -165,9 +176,10 @@ fn outputs() -> Vec<Vec<u8>> {
         }
         bytes.extend([1, shape.len() as u8]);
         shape.iter().for_each(|length| bytes.extend(length.to_le_bytes()));
-        // Boxes, scores and classes in turn, in a pattern whose length divides no row.
-        let values = [9.0_f32, 8.0, 6.0, 5.0, 0.75, 0.0, 20.0, 24.0, 0.5, 0.875, 1.0];
-        values.iter().for_each(|value| bytes.extend(value.to_le_bytes()));
+        let elements: u32 = shape.iter().product();
+        for at in 0..elements {
+            bytes.extend(value_at(layout, shape, at as usize).to_le_bytes());
+        }
         bytes
     };
     shapes.map(output).to_vec()
