@@ -4,6 +4,7 @@
 //! Nothing here depends on what a lambda is.
 
 mod atomic_write;
+mod discovery;
 mod exit;
 mod failure;
 mod line_pieces;
@@ -19,6 +20,7 @@ mod time;
 pub mod units;
 
 pub use atomic_write::{DiskSteps, WriteSteps, sync_folder, write_atomically, write_atomically_by};
+pub use discovery::ignored_variables;
 pub use exit::Exit;
 pub use failure::{Explain, Failure, chain};
 pub use line_pieces::{LinePiece, each_piece};

@@ -117,7 +117,6 @@ fn measure(bench: &str, quick: bool, folder: &Path) -> Result<(BenchEnd, bool), 
     Ok((BenchEnd::read(folder, status.success(), &status.to_string()), is_ended))
 }
 
-/// Describes an end in a line.
 fn line(end: &BenchEnd) -> String {
     match end {
         BenchEnd::Measured { goals, missed, skipped_parts } => {

@@ -105,7 +105,6 @@ fn alternate<K: Copy, const N: usize>(
     series
 }
 
-/// Drives for the replay benchmarks.
 struct ReplayBench {
     sample: PathBuf,
     imu: PathBuf,

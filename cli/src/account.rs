@@ -202,7 +202,6 @@ pub(crate) fn write_private(path: &Path, text: &[u8], may_replace: bool) -> io::
     sync_folder(folder)
 }
 
-/// Returns the path of the file.
 fn file() -> Result<PathBuf, Failure> {
     let folder = |name: &str| env::var_os(name).map(PathBuf::from).filter(|it| it.is_absolute());
     let config = folder("XDG_CONFIG_HOME").or_else(|| Some(folder("HOME")?.join(".config")));

@@ -4,7 +4,7 @@ use std::ffi::OsString;
 use std::os::unix::process::CommandExt;
 use std::process::Command;
 
-use gleaner_base::{Exit, Failure};
+use gleaner_base::{Exit, Failure, visible};
 use gleaner_parts::Parts;
 use gleaner_protocol::Report;
 use gleaner_protocol::ingress::IngressReport;
@@ -12,6 +12,7 @@ use serde::de::DeserializeOwned;
 
 use crate::args::{InspectArgs, TopicsArgs};
 use crate::render;
+use crate::replay;
 use crate::stdout::print;
 
 /// Replaces this process by the program `name`, such as `gleaner-player`.
@@ -42,11 +43,23 @@ pub(crate) fn topics(args: &TopicsArgs) -> Result<Exit, Failure> {
 pub(crate) fn inspect(args: &InspectArgs) -> Result<Exit, Failure> {
     let mut line: Vec<OsString> = vec!["inspect".into()];
     line.extend(args.all.then(|| "--all".into()));
+    line.extend(args.merge.then(|| "--merge".into()));
     line.push("--".into());
     line.extend(args.drives.iter().map(OsString::from));
     let drive = match report("gleaner-runtime", &line)? {
         Err(exit) => return Ok(exit),
         Ok(Report::Drive(drive)) => drive,
+        Ok(Report::Separate { drives }) => {
+            let mut first = Exit::Ok;
+            for (drives, name) in drives.iter().zip(replay::names(&drives)) {
+                if !args.json {
+                    print(&format!("\ndrive {}\n", visible(&name)))?;
+                }
+                let exit = inspect(&InspectArgs { drives: drives.clone(), ..*args })?;
+                first = if first == Exit::Ok { exit } else { first };
+            }
+            return Ok(first);
+        }
         Ok(_) => {
             return Err(Failure::new(Exit::Internal, "gleaner-runtime did not report a drive"));
         }

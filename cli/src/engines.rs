@@ -43,7 +43,6 @@ const PROGRESS_INTERVAL: Duration = Duration::from_secs(5);
 /// Interval of looks at the signals.
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
 
-/// The result for one model.
 #[derive(Debug, Serialize)]
 struct EngineResult {
     model: String,
@@ -115,7 +114,6 @@ impl EngineResult {
     }
 }
 
-/// The build of one engine.
 struct EngineBuild<'a> {
     parts: &'a Parts,
     build: &'a BuildDir,

@@ -5,7 +5,7 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
-use gleaner_base::{Exit, Failure};
+use gleaner_base::{Exit, Failure, visible};
 use gleaner_protocol::ReplaySummary;
 use gleaner_report::{Decisions, clips};
 use serde_json::Value;
@@ -27,10 +27,13 @@ pub(crate) fn run(args: &ReplayArgs) -> Result<Exit, Failure> {
 pub(crate) fn results(args: &ReplayArgs) -> Result<(Exit, bool), Failure> {
     let (mut result, exit) =
         runtime::run(&args.target.lambda, args.target.vehicle.as_deref(), arguments(args))?;
+    if let Some(RuntimeResult::Separate(drives)) = &result {
+        return each(args, drives).map(|exit| (exit, false));
+    }
     let has_results = result.is_some();
     if let Some(RuntimeResult::Summary(summary)) = &mut result {
         // Not the path in the report, which may come from the lambda's process.
-        summary.out = args.out.clone().unwrap_or_else(|| args.target.lambda.join("out"));
+        summary.out = out_of(args);
     }
     let report = match &result {
         Some(RuntimeResult::Summary(summary)) => report_of(&summary.out, args.no_report),
@@ -41,7 +44,7 @@ pub(crate) fn results(args: &ReplayArgs) -> Result<(Exit, bool), Failure> {
         Ok(Some(path)) if !args.json => {
             print(&format!(
                 "  {}\n",
-                Paint::of_stdout().dim(&format!("report: {}", path.display()))
+                Paint::of_stdout().dim(&format!("report: {}", visible_path(&path)))
             ))?;
         }
         Ok(_) => {}
@@ -52,6 +55,80 @@ pub(crate) fn results(args: &ReplayArgs) -> Result<(Exit, bool), Failure> {
         }
     }
     Ok((exit, has_results))
+}
+
+fn out_of(args: &ReplayArgs) -> PathBuf {
+    args.out.clone().unwrap_or_else(|| args.target.lambda.join("out"))
+}
+
+/// Replays separate drives one by one, each with a fresh lambda. Returns the first exit code that
+/// is not 0. After an error, the others are not replayed.
+fn each(args: &ReplayArgs, drives: &[Vec<PathBuf>]) -> Result<Exit, Failure> {
+    let out = out_of(args);
+    let folder = out.join("drives");
+    let _held = hold(&folder)?;
+    if out.join("summary.json").exists() {
+        eprintln!("note: the results of an earlier replay stay in `{}`", visible_path(&out));
+    }
+    let mut first = Exit::Ok;
+    for (n, (drive, name)) in drives.iter().zip(names(drives)).enumerate() {
+        if !args.json {
+            print(&format!("\ndrive {}\n", visible(&name)))?;
+        }
+        let (one, out) = (drive.clone(), Some(folder.join(name)));
+        let (exit, _) = results(&ReplayArgs { drives: one, out, ..args.clone() })?;
+        first = if first == Exit::Ok { exit } else { first };
+        let is_replayed = matches!(exit, Exit::Ok | Exit::LambdaFaulted | Exit::DriveDamaged);
+        let left = drives.len() - n - 1;
+        if !is_replayed && left > 0 {
+            eprintln!("note: {left} of {} drives were not replayed", drives.len());
+            return Ok(exit);
+        }
+    }
+    Ok(first)
+}
+
+/// Creates the folder of the results of several drives, and locks it for this set.
+fn hold(folder: &Path) -> Result<fs::File, Failure> {
+    let failed = |error: &io::Error| {
+        let action = format!("cannot lock `{}`", visible_path(folder));
+        Failure::caused_by(Exit::Internal, action, error)
+    };
+    let held = fs::create_dir_all(folder).and_then(|()| fs::File::create(folder.join(".lock")));
+    let held = held.map_err(|error| failed(&error))?;
+    match held.try_lock() {
+        Ok(()) => Ok(held),
+        Err(fs::TryLockError::WouldBlock) => {
+            let message = format!("another replay writes into `{}`", visible_path(folder));
+            Err(Failure::new(Exit::Usage, message).with_help("choose another folder: --out DIR"))
+        }
+        Err(fs::TryLockError::Error(error)) => Err(failed(&error)),
+    }
+}
+
+fn visible_path(path: &Path) -> String {
+    visible(&path.to_string_lossy())
+}
+
+/// Most bytes of the name of a drive: a number may follow.
+const NAME_BYTES: usize = 200;
+
+/// Returns a name for each drive: that of its first file or directory, with a number if another
+/// one has it.
+pub(crate) fn names(drives: &[Vec<PathBuf>]) -> Vec<String> {
+    let mut names: Vec<String> = Vec::new();
+    for drive in drives {
+        let file = drive.first().and_then(|path| path.file_name()).unwrap_or_default();
+        let file = file.to_string_lossy();
+        let name = file.strip_suffix(".zstd").unwrap_or(&file);
+        let name = [".mcap", ".db3"].iter().find_map(|end| name.strip_suffix(end)).unwrap_or(name);
+        let name = &name[..name.floor_char_boundary(NAME_BYTES)];
+        let name = if matches!(name, "" | "." | "..") { "drive" } else { name };
+        let name: String = name.chars().map(|c| if c.is_control() { '_' } else { c }).collect();
+        let mut free = (1..).map(|n| if n == 1 { name.clone() } else { format!("{name}-{n}") });
+        names.extend(free.find(|name| !names.contains(name)));
+    }
+    names
 }
 
 /// Writes the report page into `out`, unless `no_report`. The page of an earlier replay is removed
@@ -110,6 +187,8 @@ pub(crate) fn print_result(
         Some(RuntimeResult::Checked(checked)) if json => render::json_line(&checked),
         Some(RuntimeResult::Checked(checked)) => render::check_report(&checked, Paint::of_stdout()),
         Some(RuntimeResult::Summary(summary)) => summary_text(&summary)?,
+        // Only a replay reports it, which takes them one by one.
+        Some(RuntimeResult::Separate(_)) => return Ok(exit),
         Some(RuntimeResult::Verified(verified)) => render::verified(&verified, Paint::of_stdout()),
     };
     print(&text)?;
@@ -156,6 +235,13 @@ fn arguments(args: &ReplayArgs) -> Vec<OsString> {
 mod tests {
     use super::*;
     use crate::args::LambdaArgs;
+
+    #[test]
+    fn drives_are_named_by_their_files() {
+        let drives = ["a/noon.mcap", "b/noon.mcap.zstd", "bag", "2024.01_0.db3", "...mcap", "a\n"];
+        let drives = drives.map(|path| vec![PathBuf::from(path), PathBuf::from("more.mcap")]);
+        assert_eq!(names(&drives), ["noon", "noon-2", "bag", "2024.01_0", "drive", "a_"]);
+    }
 
     #[test]
     fn the_runtime_gets_the_arguments_with_the_files_last() {

@@ -66,6 +66,8 @@ pub(crate) enum RuntimeResult {
     Summary(Box<ReplaySummary>),
     Verified(Verified),
     Checked(Box<CheckReport>),
+    /// The files of each of several drives, of which none was replayed.
+    Separate(Vec<Vec<PathBuf>>),
 }
 
 /// Runs the runtime on `lambda` with these arguments, and its models within the limits of the
@@ -215,6 +217,7 @@ fn follow(reports: impl Read, bar: &ProgressBar) -> Result<Option<RuntimeResult>
                 bar.set_position(done);
             }
             Ok(Report::Summary(summary)) => return Ok(Some(RuntimeResult::Summary(summary))),
+            Ok(Report::Separate { drives }) => return Ok(Some(RuntimeResult::Separate(drives))),
             Ok(Report::Checked(checked)) => return Ok(Some(RuntimeResult::Checked(checked))),
             Ok(Report::Verified(verified)) => return Ok(Some(RuntimeResult::Verified(verified))),
             // Reports of several passes, and live reports.

@@ -18,7 +18,6 @@ use crate::args::{KeysArgs, KeysCommand, PublishArgs, SignArgs};
 use crate::render::{Paint, json_line};
 use crate::stdout::print;
 
-/// Runs `gleaner keys`.
 pub(crate) fn keys(command: &KeysCommand) -> Result<Exit, Failure> {
     match command {
         KeysCommand::New(args) => {
@@ -40,7 +39,6 @@ fn show(args: &KeysArgs, key: &PublicKey, done: &str) -> Result<Exit, Failure> {
     Ok(Exit::Ok)
 }
 
-/// Runs `gleaner publish`.
 pub(crate) fn publish(args: &PublishArgs) -> Result<Exit, Failure> {
     let key = SecretKey::load(&args.key)?;
     let out = args.out.clone().unwrap_or_else(|| args.lambda.join("revision.json"));

@@ -59,6 +59,7 @@ fn requests(socket: UnixStream) -> usize {
     while let Ok(Incoming::Message(request)) = budget::within(MEMORY, || link.poll()) {
         let sent = match &request {
             ReaderRequest::NeedDefinitions { id } => again.need_definitions(*id),
+            ReaderRequest::NeedLayout { id } => again.need_layout(*id),
             ReaderRequest::Publish { index, cdr } => {
                 assert!(cdr.len() <= PUBLISH_MAX, "a message that is too long");
                 again.publish(*index, cdr)

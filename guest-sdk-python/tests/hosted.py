@@ -31,6 +31,7 @@ entry = "main.py"
 name = "camera"
 topic = "/camera"
 type = "sensor_msgs/msg/Image"
+max_size = "1 MiB"
 depth = {depth}
 [config]
 text = {{ default = "a" }}

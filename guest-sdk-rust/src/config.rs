@@ -87,7 +87,10 @@ impl Config {
     }
 
     fn need(&self, key: &str) -> Result<&ConfigValue> {
-        self.get(key).ok_or_else(|| Error::new(format!("[config] has no `{key}`")))
+        self.get(key).ok_or_else(|| {
+            let known = self.0.iter().map(|(name, _)| format!("`{name}`")).collect::<Vec<_>>();
+            Error::new(format!("[config] has no `{key}`; its keys: {}", known.join(", ")))
+        })
     }
 }
 

@@ -11,7 +11,7 @@ use clap::Args;
 use gleaner_base::{Exit, Failure};
 use gleaner_buffers::Pool;
 use gleaner_jail::Paths;
-use gleaner_lambda::manifest::{InputSpec, Manifest, Store};
+use gleaner_lambda::manifest::{InputSpec, Manifest, Store, bounds};
 use gleaner_lambda::{BuildDir, Fault};
 use gleaner_messages::Sources;
 use gleaner_protocol::ingress::TopicGrant;
@@ -153,7 +153,10 @@ fn input_needs(input: &InputSpec) -> Vec<Need> {
     let bytes = |samples: u64| Some(samples.saturating_mul(size.bytes()));
     let place = NeedPlace::Memory;
     let need = |preallocated, purpose, bytes| Need { purpose, bytes, place, preallocated };
-    let purpose = format!("input `{name}`: {shown} samples of {size}, shared by all lambdas");
+    let mut purpose = format!("input `{name}`: {shown} samples of {size}, shared by all lambdas");
+    if size == bounds::MAX_SIZE_LARGE.default {
+        purpose += "; the default of `max_size`: `gleaner inspect DRIVE` prints one that fits";
+    }
     let mut needs = vec![need(true, purpose, bytes(shown))];
     let purpose = format!("input `{name}`: {held} samples that the lambda holds");
     needs.push(need(false, purpose, bytes(held)));

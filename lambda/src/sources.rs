@@ -12,6 +12,11 @@ use gleaner_base::{ByteSize, NotPlain};
 /// Folders beside the manifest without Python code of the lambda: output of tools, and its tests.
 const SKIPPED_FOLDERS: [&str; 4] = ["build", "out", "target", "tests"];
 
+/// Beginnings and ends of the names of files that are not data of a lambda: those of tools, texts
+/// for its authors, keys, drives and journals.
+const NO_DATA: &str = "LICENSE README lambda.toml pyproject.toml requirements revision.json \
+                       .db3 .ipynb .journal .lock .log .mcap .md .pem .rst";
+
 /// Longest Python file or message definition of a build. The longest of the standard library has
 /// 700 KiB.
 pub const SOURCE_MAX: ByteSize = ByteSize::mib(16);
@@ -29,8 +34,8 @@ pub const REQUIREMENTS: &str = "requirements.txt";
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Sources {
     /// Files copied into the build under the same name: models, message definitions
-    /// (`msg/**/*.msg`), and of a Python lambda its entry and every `.py` file that is not in
-    /// `build/`, `out/`, `target/` or `tests/` beside the manifest.
+    /// (`msg/**/*.msg`), and of a Python lambda its entry, its data `files` and every `.py` file
+    /// that is not in `build/`, `out/`, `target/` or `tests/` beside the manifest.
     pub copied: BTreeSet<PathBuf>,
     /// Files that a build reads but does not copy. Of a Rust lambda, those that are compiled into
     /// the entry: `Cargo.toml`, `build.rs`, and all in `src/`. Of a Python lambda,
@@ -51,24 +56,52 @@ impl Sources {
         let named = models.flat_map(|model| std::iter::once(&model.file).chain(&model.labels));
         let copied = named.map(|file| file.as_path().to_owned()).collect();
         let mut sources = Sources { copied, compiled: BTreeSet::new() };
-        sources.copied.extend(files(dir, "msg", |_| true, |file| has_extension(file, "msg"))?);
+        let is_file = |file: &Path| dir.join(file).is_file();
+        let is_message = |file: &Path| has_extension(file, "msg") && is_file(file);
+        sources.copied.extend(files(dir, "msg", |_| true, is_message)?);
+        for data in &manifest.lambda.files {
+            if dir.join(data.as_path()).is_dir() {
+                // A link to a folder, or a pipe, is listed too: the build refuses it by name.
+                sources.copied.extend(files(dir, data.as_str(), |_| true, |_| true)?);
+            } else {
+                sources.copied.insert(data.as_path().to_owned());
+            }
+        }
         match manifest.lambda.kind {
             LambdaKind::Python => {
                 sources.compiled.insert(REQUIREMENTS.into());
                 sources.copied.insert(manifest.lambda.entry.as_path().to_owned());
-                let is_of_the_lambda = |folder: &Path| {
-                    !SKIPPED_FOLDERS.iter().any(|skipped| folder == Path::new(skipped))
-                };
-                sources
-                    .copied
-                    .extend(files(dir, "", is_of_the_lambda, |file| has_extension(file, "py"))?);
+                let is_code = |file: &Path| has_extension(file, "py") && is_file(file);
+                let enters = |at: &Path| !SKIPPED_FOLDERS.iter().any(|it| at == Path::new(it));
+                sources.copied.extend(files(dir, "", enters, is_code)?);
             }
             LambdaKind::Wasm => {
                 sources.compiled.extend(["Cargo.toml", "build.rs"].map(PathBuf::from));
-                sources.compiled.extend(files(dir, "src", |_| true, |_| true)?);
+                sources.compiled.extend(files(dir, "src", |_| true, is_file)?);
             }
         }
         Ok(sources)
+    }
+
+    /// Returns the files in the folder of a Python lambda that its build leaves out, sorted, except
+    /// for those that are no data: of tools, for readers, keys, drives and results.
+    ///
+    /// # Errors
+    ///
+    /// As for [`of`](Self::of).
+    pub fn left_out(&self, lambda_dir: impl AsRef<Path>) -> Result<Vec<PathBuf>, LayoutError> {
+        let enters = |at: &Path| {
+            let is_other = SKIPPED_FOLDERS.iter().chain(&["live"]).any(|it| at == Path::new(it));
+            !is_other && !has_extension(at, "egg-info")
+        };
+        let is_data = |file: &Path| {
+            let name = file.file_name().unwrap_or_default().to_string_lossy();
+            !self.copied.contains(file)
+                && !NO_DATA.split(' ').any(|part| name.starts_with(part) || name.ends_with(part))
+        };
+        let mut found = files(lambda_dir.as_ref(), "", enters, is_data)?;
+        found.sort();
+        Ok(found)
     }
 
     /// Returns all sources.
@@ -106,7 +139,7 @@ fn files(
                 if enters(&relative) && !entry.path().join("pyvenv.cfg").is_file() {
                     folders.push(relative);
                 }
-            } else if takes(&relative) && entry.path().is_file() {
+            } else if takes(&relative) {
                 found.push(relative);
             }
         }
@@ -184,6 +217,24 @@ mod tests {
             ["main.py", "models/m.onnx", "msg/a/msg/B.msg", "other.py", "part/build/deep.py"]
         );
         assert_eq!(compiled, ["requirements.txt"]);
+    }
+
+    #[test]
+    fn data_files_are_copied_if_the_manifest_names_them_and_else_left_out() {
+        let dir = folder();
+        for file in ["a.json", "calib/.b", "calib/deep/c", "calib/d.csv", "live/log", "x.pem"] {
+            dir.write(file, "");
+        }
+        let manifest = "lambda = { name = 'x', version = '0.1.0', kind = 'python', \
+                        entry = 'main.py', files = ['calib', 'gone'] }\nschedule.period = '1s'\n";
+        let manifest = Manifest::parse(manifest, "lambda.toml").unwrap();
+        let sources = Sources::of(dir.root(), &manifest).unwrap();
+        let code = ["main.py", "msg/a/msg/B.msg", "other.py", "part/build/deep.py"];
+        let data = ["calib/d.csv", "calib/deep/c", "gone"];
+        let expected = code.iter().chain(&data).map(PathBuf::from).collect::<BTreeSet<_>>();
+        assert_eq!(sources.copied, expected);
+        let left_out = ["Cargo.toml", "a.json", "src/data.bin", "src/inner/mod.rs"];
+        assert_eq!(sources.left_out(dir.root()).unwrap(), left_out.map(PathBuf::from));
     }
 
     #[test]

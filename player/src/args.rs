@@ -24,9 +24,12 @@ use crate::stamp::StampMode;
     .multiple(true)
     .args(["drives", "synthetic", "imu"]))]
 pub(crate) struct Args {
-    /// MCAP files; several are merged by time
+    /// MCAP files of one drive
     #[arg(value_name = "DRIVE")]
     pub(crate) drives: Vec<PathBuf>,
+    /// Merge all files by time, even if they are separate drives
+    #[arg(long)]
+    pub(crate) merge: bool,
     /// Speed: 1 is as recorded, 2 twice as fast, max as fast as writers accept
     #[arg(long, value_name = "R", default_value = "1")]
     pub(crate) rate: Rate,

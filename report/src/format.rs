@@ -107,6 +107,20 @@ pub fn gist(message: &str) -> &str {
     line.unwrap_or_default()
 }
 
+/// Returns `message` with each number as `#`, except for places in code (`lib.rs:17:9`, `line 3`).
+/// Faults that are equal then have one cause.
+pub fn without_numbers(message: &str) -> String {
+    let (mut key, mut previous) = (Vec::new(), "");
+    for word in message.split_inclusive(char::is_whitespace) {
+        let is_place = word.contains(".rs:") || previous == "line ";
+        let hides = |letter: char| letter.is_ascii_digit() && !is_place;
+        key.extend(word.chars().map(|letter| if hides(letter) { '#' } else { letter }));
+        previous = word;
+    }
+    key.dedup_by(|a, b| (*a, *b) == ('#', '#'));
+    key.into_iter().collect()
+}
+
 /// Cuts `text` to `chars` characters and marks the cut with `…`.
 pub(crate) fn cut(text: &str, chars: usize) -> String {
     match text.char_indices().nth(chars) {

@@ -18,7 +18,6 @@ use crate::results::ResultsError;
 
 /// Maximum number of topics in a summary. A lambda has fewer, but the file is untrusted.
 const TOPICS_MAX: usize = 256;
-/// Maximum number of drives in a summary.
 const DRIVES_MAX: usize = 50;
 /// Maximum number of characters of a name.
 const NAME_CHARS: usize = 300;
@@ -135,7 +134,6 @@ pub(crate) struct TopicCounts {
 }
 
 impl RunSummary {
-    /// Reads `out/summary.json`.
     fn of(out: &Path) -> Result<Self, OutputError> {
         let text = match read_bounded(out, "summary.json", SUMMARY_MAX) {
             Ok(text) => text,
@@ -418,7 +416,6 @@ fn parsed<T: DeserializeOwned>(name: &'static str, text: &[u8]) -> Result<T, Fil
     serde_json::from_slice(text).map_err(|source| FileError::Json { name, source })
 }
 
-/// Reads the file `name` of `out`.
 fn read_bounded(out: &Path, name: &'static str, max: ByteSize) -> Result<Vec<u8>, FileError> {
     let read = PlainFile::result(&out.join(name), max).and_then(PlainFile::read_whole);
     read.map_err(|source| FileError::Read { name, source })

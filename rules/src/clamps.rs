@@ -93,7 +93,7 @@ impl WrongField {
 
     /// Returns the error for a field of `type_name` that is read as a number and is not one.
     pub fn no_number(path: &str, type_name: &str) -> Self {
-        Self::new(path, format!("of `{type_name}` is not a number"))
+        Self::new(path, format!("of `{type_name}` is not a number; `get` reads it"))
     }
 
     /// Returns the error for a field of the input `belongs`, used on the input `used`.

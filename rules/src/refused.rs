@@ -13,8 +13,9 @@ pub fn no_such_input<S: AsRef<str>>(name: &str, known: impl IntoIterator<Item = 
 
 /// Returns the text for an unknown model.
 pub fn no_such_model<S: AsRef<str>>(name: &str, known: impl IntoIterator<Item = S>) -> String {
-    let name = name.chars().take(64).collect::<String>();
-    format!("no model `{name}`; the manifest has {}", quoted(known))
+    let (name, known) = (name.chars().take(64).collect::<String>(), quoted(known));
+    let way_out = if known == "none" { "; add a [[model]] of this name" } else { "" };
+    format!("no model `{name}`; the manifest has {known}{way_out}")
 }
 
 /// Returns the text for a message whose bytes do not match its type.

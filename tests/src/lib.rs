@@ -11,6 +11,7 @@ pub mod namespace;
 pub mod parts;
 pub mod peers;
 pub mod random;
+pub mod readers;
 pub mod rooms;
 #[path = "../../base/src/shared_data.rs"]
 mod shared_data;

@@ -39,6 +39,17 @@ impl TestVehicle {
         vehicle
     }
 
+    /// As [`new`](Self::new), with an orchestrator.
+    ///
+    /// # Panics
+    ///
+    /// If it does not start.
+    pub fn started() -> Self {
+        let mut vehicle = Self::new();
+        vehicle.start();
+        vehicle
+    }
+
     /// Returns a path in its folder.
     pub fn path(&self, name: &str) -> PathBuf {
         self.folder.path().join(name)
@@ -148,6 +159,16 @@ impl TestVehicle {
         let lambda = lambda.to_str().expect("a plain path");
         let key = self.key("deployer");
         self.gleaner(&[&["deploy", "--local", lambda, "--key", &key], args].concat())
+    }
+
+    /// Publishes and deploys a build.
+    ///
+    /// # Panics
+    ///
+    /// If it fails.
+    pub fn deploys(&self, lambda: &Path) {
+        let deployed = self.deploy(lambda, &[]);
+        assert!(deployed.status.success(), "{}", text(&deployed));
     }
 
     /// Runs `gleaner` with these arguments.

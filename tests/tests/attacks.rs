@@ -15,7 +15,6 @@ use libtest_mimic::{Arguments, Trial};
 /// Environment variable with the case that this process runs in its private network.
 const CASE: &str = "GLEANER_ATTACK_CASE";
 
-/// Documented outcome of an attack.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 enum AttackOutcome {
     /// The wake ends with this fault; the process goes on.

@@ -62,7 +62,6 @@ fn parts(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
     steps::run(&mut bench, "see the first error above").map(|()| Exit::Ok)
 }
 
-/// Compares results that were stored.
 fn compare(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
     setup::binary(checkout, "gleaner-bench")?;
     start(checkout, "gleaner-bench", arguments)

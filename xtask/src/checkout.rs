@@ -87,6 +87,18 @@ impl Checkout {
         command
     }
 
+    /// The environment of Python that has the library of ONNX Runtime, once the demo has made it.
+    pub(crate) fn onnxruntime(&self) -> PathBuf {
+        self.target.join("onnxruntime")
+    }
+
+    /// A [`command`](Self::command) of a program that cargo built and that may run models.
+    pub(crate) fn with_models(&self, program: &str) -> Command {
+        let mut command = self.command(self.program(program));
+        command.env("VIRTUAL_ENV", self.onnxruntime());
+        command
+    }
+
     /// Cargo as a [`command`](Self::command), without the variables in which `cargo run` describes
     /// this package: some build scripts look at them, and would run again after each build without
     /// xtask, with all that depends on them.

@@ -59,7 +59,6 @@ pub(crate) const EXAMPLES: [Example; 4] = [
     },
 ];
 
-/// Results of a replay with one twin.
 pub(crate) struct TwinReplay {
     pub(crate) summary: ReplaySummary,
     /// Decisions with a trigger or a fault.
@@ -156,7 +155,7 @@ fn replay(
     settings: Vec<String>,
 ) -> Result<TwinReplay, Failure> {
     let out = Path::new("out/demo").join(name);
-    let mut replay = checkout.command(checkout.program("gleaner"));
+    let mut replay = checkout.with_models("gleaner");
     replay
         .arg("replay")
         .arg(&lambda)
@@ -178,7 +177,7 @@ fn replay(
 impl TwinReplay {
     /// Repeats every decision of the journal, from the drive.
     pub(crate) fn verify(&self, checkout: &Checkout) -> Result<Verified, Failure> {
-        let mut verify = checkout.command(checkout.program("gleaner"));
+        let mut verify = checkout.with_models("gleaner");
         verify
             .arg("replay")
             .arg(&self.lambda)
@@ -195,7 +194,7 @@ impl TwinReplay {
         checkout: &Checkout,
         clip: &Clip,
     ) -> Result<Verified, Failure> {
-        let mut verify = checkout.command(checkout.program("gleaner"));
+        let mut verify = checkout.with_models("gleaner");
         verify
             .arg("verify")
             .arg(self.out.join(&clip.file))

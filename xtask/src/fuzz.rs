@@ -69,7 +69,6 @@ pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, F
 }
 
 struct FuzzArgs {
-    /// The targets, each once.
     targets: Vec<&'static str>,
     seconds: u64,
     seed: Option<u64>,
@@ -232,11 +231,9 @@ impl Fuzz<'_> {
     }
 }
 
-/// Statistics in libFuzzer's output.
 struct FuzzStats {
     executions: String,
     reached: String,
-    /// Path of the failing input.
     input: Option<String>,
 }
 

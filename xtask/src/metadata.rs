@@ -9,7 +9,6 @@ use crate::steps;
 #[derive(Deserialize)]
 pub(crate) struct Metadata {
     pub(crate) packages: Vec<Package>,
-    /// The ids of the default members.
     workspace_default_members: Vec<String>,
 }
 

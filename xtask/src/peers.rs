@@ -79,7 +79,6 @@ impl Peers<'_> {
         succeeds(self.checkout.command(program).arg(argument))
     }
 
-    /// Returns whether a compiler finds a header.
     fn has_header(&self, compiler: &str, language: &str, header: &str) -> bool {
         let mut compile = self.checkout.command(compiler);
         succeeds(compile.args(["-fsyntax-only", "-x", language, "-include", header, "/dev/null"]))

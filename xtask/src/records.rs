@@ -108,7 +108,6 @@ const COMMON: [&str; 4] = [".cargo/config.toml", "Cargo.lock", "Cargo.toml", "wi
 const HOUSE: [&str; 4] =
     ["tests/src/budgets.rs", "tests/src/rooms.rs", "tests/src/words.rs", "tests/tests/house"];
 
-/// The record of a part.
 #[derive(Debug, Serialize, Deserialize)]
 struct Record {
     digest: String,
@@ -118,7 +117,6 @@ struct Record {
     result: String,
 }
 
-/// PartRecords by the names of their parts.
 type PartRecords = BTreeMap<String, Record>;
 
 /// Runs all parts, and writes their records.

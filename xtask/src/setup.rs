@@ -141,7 +141,6 @@ pub(crate) fn binary(checkout: &Checkout, name: &str) -> Result<(), Failure> {
     steps::run(&mut build, "see the first error above")
 }
 
-/// Builds the lambdas in these folders.
 pub(crate) fn build_lambdas(checkout: &Checkout, folders: &[PathBuf]) -> Result<(), Failure> {
     for lambda in folders {
         let mut build = checkout.command(checkout.program("gleaner"));

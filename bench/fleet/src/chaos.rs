@@ -45,7 +45,6 @@ struct FleetMembers<'f> {
     identities: &'f [SimulatedIdentity],
 }
 
-/// A line of records.
 #[derive(Deserialize)]
 struct StoredLine {
     seq: u64,

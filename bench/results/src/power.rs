@@ -17,7 +17,6 @@ pub struct PowerMeter {
     rails: Vec<Rail>,
 }
 
-/// A counter of energy.
 #[derive(Debug)]
 struct EnergyCounter {
     name: String,

@@ -74,7 +74,6 @@ enum CheaperKind {
     Python,
 }
 
-/// A cost that decides between the kinds.
 struct Criterion<'a> {
     name: &'a str,
     wasm: f64,

@@ -16,7 +16,6 @@ const FRAMES: usize = 8;
 /// Bytes of a frame: bgr8.
 const BYTES: usize = 3 * WIDTH as usize * HEIGHT as usize;
 
-/// The file.
 pub(super) struct FrameFile {
     pub(super) path: PathBuf,
     file: File,

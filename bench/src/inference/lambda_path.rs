@@ -35,7 +35,6 @@ pub(super) struct LambdaPath {
     pub(super) runtime: String,
 }
 
-/// The result of a run.
 pub(super) struct PathResult {
     /// From the frame to its boxes.
     pub(super) total: Duration,

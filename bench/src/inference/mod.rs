@@ -28,7 +28,6 @@ use python_program::{PythonProgram, PythonResult};
 
 pub use yolo_graph::{GraphScale, yolo_shaped};
 
-/// Threads of one run.
 const THREADS: u32 = 1;
 /// Requirements for detections, the same for all programs.
 const MIN_SCORE: f32 = 0.4;
@@ -77,7 +76,6 @@ fn models(folder: &TempFolder, quick: bool) -> Vec<BenchModel> {
     ]
 }
 
-/// Times of one program, in ms.
 #[derive(Default)]
 struct DetectorTimes {
     total: Vec<f64>,
@@ -114,7 +112,6 @@ impl DetectorTimes {
     }
 }
 
-/// A way through `gleaner-inference` that is measured.
 struct MeasuredPath {
     process: ModelProcess,
     path: LambdaPath,

@@ -18,11 +18,9 @@ use sha2::{Digest, Sha256};
 /// A model of a measurement.
 pub(super) struct BenchModel {
     pub(super) name: &'static str,
-    /// Layout of the detector.
     pub(super) layout: gleaner_vision::DetectorLayout,
     pub(super) path: std::path::PathBuf,
     pub(super) sha256: String,
-    /// Number of frames.
     pub(super) frames: usize,
 }
 
@@ -39,7 +37,6 @@ pub(super) struct ModelProcess {
 }
 
 impl ModelProcess {
-    /// Starts the process with one model.
     pub(super) fn start(model: &BenchModel) -> Self {
         let (control, end) = InferenceControl::pair().expect("sockets");
         let (handover, stdin) = UnixStream::pair().expect("sockets");

@@ -14,9 +14,7 @@ use super::blocks::{BLOCK_MS, BlockSchedule};
 use crate::measure::{Twin, bind_to};
 use gleaner_bench_results::Figure;
 
-/// An attack and its attacker.
 pub(super) struct Attack {
-    /// Description in the table.
     name: &'static str,
     /// Name of the behaviour in the lambda, and its language. `None` for a busy thread of the
     /// bench: it shows what the machine itself does not isolate.
@@ -27,7 +25,6 @@ const fn by(name: &'static str, behaviour: &'static str, kind: Twin) -> Attack {
     Attack { name, by: Some((behaviour, kind)) }
 }
 
-/// All attacks.
 pub(super) const ATTACKS: &[Attack] = &[
     Attack { name: "busy thread, not a lambda", by: None },
     by("endless loop", "endless", Twin::Rust),

@@ -33,7 +33,6 @@ impl BlockSchedule {
         usize::try_from(block).ok().filter(|block| is_in && *block < 2 * self.pairs)
     }
 
-    /// Groups values by block.
     pub(super) fn grouped(
         &self,
         values: impl Iterator<Item = (Option<usize>, f64)>,

@@ -22,7 +22,6 @@ const STATUS_NS: i64 = 1_050_000_000;
 pub(super) struct Victim {
     kind: Twin,
     topic: String,
-    /// RttReceiver during the current attack.
     answers: Option<Arc<RttReceiver>>,
     started: RunningProgram,
     out: TempFolder,

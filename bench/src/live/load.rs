@@ -37,7 +37,6 @@ pub(super) fn more_imu(number: u32) -> String {
     format!("/imu/more_{number}")
 }
 
-/// The costs of a load.
 pub(super) struct LoadCosts {
     /// Shares of a core, of the ingress and of all processes.
     pub(super) ingress_percent: f64,
@@ -63,7 +62,6 @@ struct Process {
 }
 
 impl Load<'_> {
-    /// Measures the load.
     pub(super) fn measure(&self, figures: &mut Vec<Figure>) -> LoadCosts {
         let copies = self.lambdas.iter().flat_map(|(lambda, count)| {
             let folder = format!("bench/lambdas/{lambda}/{}", self.kind.folder());
@@ -216,7 +214,6 @@ impl Costs {
     }
 }
 
-/// The processes of a run.
 pub(crate) struct LiveProcesses {
     ingress: Option<u32>,
     pub(crate) shims: Vec<u32>,

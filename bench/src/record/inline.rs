@@ -139,9 +139,7 @@ fn subscribe(loopback: &mut Loopback, recorder: &Arc<Mutex<Recorder>>, name: &st
     let topic = TopicSchema {
         name: name.to_owned(),
         type_name: type_name.to_owned(),
-        definitions: None,
-        offered_qos: None,
-        other_definitions: Vec::new(),
+        ..TopicSchema::default()
     };
     let topic = recorder.lock().expect("one thread").add_topic(topic).expect("few topics");
     let spec = TopicSpec {

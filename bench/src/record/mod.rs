@@ -12,7 +12,6 @@ use gleaner_bench_results::{Figure, quantile};
 use gleaner_journal::{InputView, JournalEntry, JournalHeader, LogDigest, WakeSource};
 use gleaner_lambda::manifest::Store;
 use gleaner_lambda::{Trigger, TriggerKind};
-use gleaner_messages::Endian;
 use gleaner_transport::{Guid, SampleMeta};
 
 use inline::record;
@@ -116,21 +115,7 @@ impl Traffic {
     /// Publishes frame `n` at `at_ns`, and the messages up to the next frame.
     fn frame(&self, n: u64, at_ns: i64, mut publish: impl FnMut(&str, &SampleMeta, &[u8])) {
         let mut publish = |name: &str, at_ns: i64, seq: u64, cdr: &[u8]| {
-            let (writer, endian) = (Guid::default(), Endian::Little);
-            publish(
-                name,
-                &SampleMeta {
-                    at_ns,
-                    publish_ns: at_ns,
-                    writer,
-                    seq,
-                    endian,
-                    options: [0; 2],
-                    layout: 0,
-                    is_latched: false,
-                },
-                cdr,
-            );
+            publish(name, &SampleMeta::new(at_ns, Guid::default(), seq), cdr);
         };
         publish("/camera", at_ns, n + 1, &self.frame);
         for i in 0..IMU_PER_FRAME {

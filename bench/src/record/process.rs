@@ -186,7 +186,6 @@ fn publish(network: &Loopback, traffic: &Traffic, clock: Clock, stop: &AtomicBoo
     longest.as_secs_f64() * 1e3
 }
 
-/// The final report of the program.
 fn last(reports: PipeReader) -> Option<RecorderStatus> {
     BufReader::new(reports).lines().map_while(Result::ok).find_map(
         |line| match serde_json::from_str(&line) {

@@ -4,7 +4,6 @@ use gleaner_bench_results::CoreList;
 
 use crate::measure::{bind_to, cores};
 
-/// The cores of a run.
 pub(super) struct CoreSplit {
     all: CoreList,
     sides: CoreList,

@@ -11,7 +11,6 @@ use serde_json::Value;
 use super::ANSWERS;
 use super::workload::Workload;
 
-/// Kinds of nodes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum NodeKind {
     /// Cyclone DDS for Python: a stand-in where there is no ROS 2.

@@ -22,7 +22,6 @@ use crate::measure::{Twin, pss_mib};
 /// samples of an IMU at 100 Hz.
 const MEMORY_INTERVAL: Duration = Duration::from_secs(4);
 
-/// A side.
 pub(super) enum Side {
     /// A reader that only answers.
     Bare,
@@ -61,7 +60,6 @@ pub(super) struct Turn {
     pub(super) facts: BTreeMap<String, String>,
 }
 
-/// A side that runs.
 enum RunningSide {
     Bare(BareReader),
     Lambda(RunningProgram, TempFolder),

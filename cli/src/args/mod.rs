@@ -209,9 +209,12 @@ pub struct RunArgs {
     #[arg(long)]
     pub out: Option<PathBuf>,
     /// Play this recorded drive once instead of joining the network: an MCAP file, a rosbag2 .db3
-    /// file or a directory; several are merged by time
+    /// file or a directory; several have to be of one drive
     #[arg(long, value_name = "DRIVE", conflicts_with_all = ["domain", "interface"])]
     pub drive: Vec<PathBuf>,
+    /// Merge all files by time, even if they are separate drives
+    #[arg(long, requires = "drive")]
+    pub merge: bool,
     /// Play the drive this many times as fast as it was recorded [default: 1]
     #[arg(long, value_name = "X", value_parser = rate, requires = "drive")]
     pub rate: Option<f64>,
@@ -267,9 +270,12 @@ pub struct RunArgs {
 /// Arguments of `gleaner inspect`.
 #[derive(Args, Debug)]
 pub struct InspectArgs {
-    /// MCAP files, rosbag2 .db3 files and directories; several are merged into one drive
+    /// MCAP files, rosbag2 .db3 files and directories; separate drives are shown one by one
     #[arg(value_name = "DRIVE", required = true)]
     pub drives: Vec<PathBuf>,
+    /// Merge all files by time, even if they are separate drives
+    #[arg(long)]
+    pub merge: bool,
     /// Read a drive of more than 256 MiB completely, not only three parts of it
     #[arg(long)]
     pub all: bool,
@@ -315,16 +321,16 @@ pub struct CheckArgs {
 }
 
 /// Arguments of `gleaner replay`.
-#[derive(Args, Debug)]
+#[derive(Args, Clone, Debug)]
 pub struct ReplayArgs {
     #[command(flatten)]
     #[allow(missing_docs)]
     pub target: LambdaArgs,
-    /// MCAP files, rosbag2 .db3 files and directories, plain or compressed with zstd; several are
-    /// merged by time
+    /// MCAP files, rosbag2 .db3 files and directories, plain or compressed with zstd; separate
+    /// drives are replayed one by one, each with results in a folder of OUT/drives
     #[arg(value_name = "DRIVE", required = true)]
     pub drives: Vec<PathBuf>,
-    /// Merge drives that overlap in time and have a topic in common, which is refused otherwise
+    /// Merge all files by time, even if they are separate drives
     #[arg(long)]
     pub merge: bool,
     /// Start at this time: seconds after the start of the drive, as in 12.5 or 2min, or since 1970,
@@ -396,10 +402,10 @@ pub struct DevArgs {
     #[command(flatten)]
     #[allow(missing_docs)]
     pub target: LambdaArgs,
-    /// MCAP files, rosbag2 .db3 files and directories; several are merged by time
+    /// MCAP files, rosbag2 .db3 files and directories, as for `gleaner replay`
     #[arg(value_name = "DRIVE", required = true)]
     pub drives: Vec<PathBuf>,
-    /// Merge drives that overlap in time and have a topic in common, which is refused otherwise
+    /// Merge all files by time, even if they are separate drives
     #[arg(long)]
     pub merge: bool,
     /// Start at this time, as in `gleaner replay`

@@ -16,7 +16,7 @@ use std::fs::File;
 use std::path::Path;
 use std::time::SystemTime;
 
-use gleaner_base::{ByteSize, Exit, Failure, PlainFile};
+use gleaner_base::{ByteSize, Exit, Failure, PlainFile, excerpt};
 use gleaner_lambda::layout::FILE_MAX;
 use gleaner_lambda::manifest::LambdaKind;
 use gleaner_lambda::{BuildDir, LayoutError, Manifest, SOURCE_MAX, Sources};
@@ -43,10 +43,11 @@ pub(crate) fn run(args: &BuildArgs) -> Result<Exit, Failure> {
     let (path, files) = (BuildDir::of(dir), built.files);
     let files = if files == 1 { "1 file".to_owned() } else { format!("{files} files") };
     print(&format!(
-        "built {} ({files}, {})\n{}{}",
+        "built {} ({files}, {})\n{}{}{}",
         path.path().display(),
         size(built.bytes),
         note(&manifest),
+        left_out(dir, &manifest),
         wheels::note(dir, &path)
     ))?;
     Ok(Exit::Ok)
@@ -60,7 +61,7 @@ fn build(args: &BuildArgs, manifest: &Manifest, started: SystemTime) -> Result<B
 
     let mut partial = PartialBuild::begin(dir)?;
     let sources = Sources::of(dir, manifest).map_err(BuildError::Sources)?;
-    check_named(dir, manifest)?;
+    check_named(dir, manifest, &sources)?;
     if manifest.lambda.kind == LambdaKind::Wasm {
         let component = component::compile(dir, args.sandboxed)?;
         partial.add(&component.path, component.opened, manifest.lambda.entry.as_path())?;
@@ -84,7 +85,8 @@ fn build(args: &BuildArgs, manifest: &Manifest, started: SystemTime) -> Result<B
 /// Returns the maximum size of a file that a build copies.
 fn max_size(manifest: &Manifest, source: &Path) -> ByteSize {
     let is_model = manifest.models.iter().any(|model| model.file.as_path() == source);
-    if is_model { FILE_MAX } else { SOURCE_MAX }
+    let is_data = || manifest.lambda.files.iter().any(|data| source.starts_with(data.as_path()));
+    if is_model || is_data() { FILE_MAX } else { SOURCE_MAX }
 }
 
 /// Returns a note if clips of this lambda cannot be verified alone; else an empty text.
@@ -107,6 +109,20 @@ fn note(manifest: &Manifest) -> String {
     }
 }
 
+/// Returns a note with the first files that the build of a Python lambda lacks; else an empty text.
+fn left_out(dir: &Path, manifest: &Manifest) -> String {
+    let found = Sources::of(dir, manifest).and_then(|sources| sources.left_out(dir));
+    // The build is complete, with or without a note.
+    let paths = found.unwrap_or_default();
+    if paths.is_empty() || manifest.lambda.kind != LambdaKind::Python {
+        return String::new();
+    }
+    let shown: Vec<_> = paths.iter().take(5).map(|path| excerpt(&path.to_string_lossy())).collect();
+    let (more, shown) = (paths.len() - shown.len(), shown.join("`, `"));
+    let more = if more == 0 { String::new() } else { format!(" and {more} more") };
+    format!("note: not built in: `{shown}`{more}; add data of the lambda to `files` of [lambda]\n")
+}
+
 /// Checks that the entry has the extension of its kind, so that it cannot be the manifest or a
 /// message definition.
 fn check_entry(manifest: &Manifest) -> Result<(), BuildError> {
@@ -122,16 +138,22 @@ fn check_entry(manifest: &Manifest) -> Result<(), BuildError> {
 }
 
 /// Checks that the files in the manifest exist, except for the entry that the compiler makes.
-fn check_named(dir: &Path, manifest: &Manifest) -> Result<(), BuildError> {
+fn check_named(dir: &Path, manifest: &Manifest, sources: &Sources) -> Result<(), BuildError> {
     let entry = (manifest.lambda.kind == LambdaKind::Python)
         .then(|| (manifest.lambda.entry.as_path(), "`entry`"));
     let models =
         manifest.models.iter().map(|model| (model.file.as_path(), "`file` of a [[model]]"));
-    // What exists but is not a file is refused when it is copied.
-    match entry.into_iter().chain(models).find(|(file, _)| !dir.join(file).exists()) {
-        Some((file, named_by)) => Err(BuildError::Missing { path: dir.join(file), named_by }),
-        None => Ok(()),
+    let data = manifest.lambda.files.iter().map(|file| (file.as_path(), "`files` of [lambda]"));
+    let is_copied = |named: &Path| sources.copied.iter().any(|file| file.starts_with(named));
+    for (file, named_by) in entry.into_iter().chain(models).chain(data) {
+        let path = dir.join(file);
+        // Of a folder, any file. What exists but is not a file is refused when it is copied.
+        let path = if path.is_dir() && !is_copied(file) { path.join("*") } else { path };
+        if !path.exists() {
+            return Err(BuildError::Missing { path, named_by });
+        }
     }
+    Ok(())
 }
 
 #[cfg(test)]

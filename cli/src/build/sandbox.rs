@@ -39,7 +39,6 @@ pub(super) struct Sandbox {
     target: PathBuf,
 }
 
-/// Output of `cargo metadata`.
 #[derive(Deserialize)]
 struct CargoMetadata {
     workspace_root: PathBuf,

@@ -1,40 +1,38 @@
 use std::fs;
-use std::path::{Path, PathBuf};
-use std::process;
-use std::sync::atomic::{AtomicU32, Ordering};
+use std::path::Path;
 use std::time::Duration;
+
+use tempfile::TempDir;
 
 use super::*;
 
 const PYTHON: &str = "lambda = { name = 'x', version = '0.1.0', kind = 'python', entry = 'main.py' }\nschedule.period = '1s'\n";
 
 /// A lambda's folder, removed when the test ends.
-struct LambdaFolder(PathBuf);
+struct LambdaFolder(TempDir);
 
 impl LambdaFolder {
     fn new(manifest: &str) -> LambdaFolder {
-        static COUNT: AtomicU32 = AtomicU32::new(0);
-        let name =
-            format!("gleaner-cli-{}-{}", process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
-        let lambda = LambdaFolder(std::env::temp_dir().join(name));
+        let folder = tempfile::Builder::new().prefix("gleaner-cli-").tempdir();
+        let lambda = LambdaFolder(folder.unwrap());
         lambda.write("lambda.toml", manifest);
         lambda
     }
 
     fn write(&self, relative: &str, text: &str) {
-        let path = self.0.join(relative);
+        let path = self.0.path().join(relative);
         fs::create_dir_all(path.parent().unwrap()).unwrap();
         fs::write(path, text).unwrap();
     }
 
     fn build(&self) -> Result<Built, BuildError> {
         let started = SystemTime::now();
-        let args = BuildArgs { lambda: self.0.clone(), ..BuildArgs::default() };
-        build(&args, &Manifest::load(&self.0).unwrap(), started)
+        let args = BuildArgs { lambda: self.0.path().to_owned(), ..BuildArgs::default() };
+        build(&args, &Manifest::load(self.0.path()).unwrap(), started)
     }
 
     fn read(&self, relative: &str) -> Option<String> {
-        fs::read_to_string(self.0.join(relative)).ok()
+        fs::read_to_string(self.0.path().join(relative)).ok()
     }
 
     /// Returns all files in the folder `relative`, sorted.
@@ -50,15 +48,9 @@ impl LambdaFolder {
             }
         }
         let mut found = Vec::new();
-        walk(&self.0.join(relative), &self.0.join(relative), &mut found);
+        walk(&self.0.path().join(relative), &self.0.path().join(relative), &mut found);
         found.sort();
         found
-    }
-}
-
-impl Drop for LambdaFolder {
-    fn drop(&mut self) {
-        let _ = fs::remove_dir_all(&self.0);
     }
 }
 
@@ -92,12 +84,12 @@ fn a_second_build_replaces_the_first_and_leaves_nothing_else() {
     lambda.write("main.py", "1");
     lambda.write("gone.py", "");
     lambda.build().unwrap();
-    fs::remove_file(lambda.0.join("gone.py")).unwrap();
+    fs::remove_file(lambda.0.path().join("gone.py")).unwrap();
     lambda.write("main.py", "2");
     lambda.build().unwrap();
     assert_eq!(lambda.files(""), ["build/lambda.toml", "build/main.py", "lambda.toml", "main.py"]);
     assert_eq!(lambda.read("build/main.py").as_deref(), Some("2"));
-    assert!(BuildDir::check_fresh(&lambda.0).is_ok());
+    assert!(BuildDir::check_fresh(lambda.0.path()).is_ok());
 }
 
 #[test]
@@ -105,7 +97,7 @@ fn a_build_that_fails_leaves_the_old_one_as_it_was() {
     let lambda = LambdaFolder::new(PYTHON);
     lambda.write("main.py", "1");
     lambda.build().unwrap();
-    fs::remove_file(lambda.0.join("main.py")).unwrap();
+    fs::remove_file(lambda.0.path().join("main.py")).unwrap();
     let error = lambda.build().unwrap_err();
     assert!(
         matches!(&error, BuildError::Missing { path, .. } if path.ends_with("main.py")),
@@ -131,9 +123,9 @@ fn a_build_is_fresh_until_one_of_its_sources_changes() {
     lambda.build().unwrap();
     let later = |relative: &str| {
         lambda.write(relative, "2");
-        let file = File::options().write(true).open(lambda.0.join(relative)).unwrap();
+        let file = File::options().write(true).open(lambda.0.path().join(relative)).unwrap();
         file.set_modified(SystemTime::now() + Duration::from_secs(60)).unwrap();
-        BuildDir::check_fresh(&lambda.0).is_ok()
+        BuildDir::check_fresh(lambda.0.path()).is_ok()
     };
     assert!(later("tests/test_main.py") && later("out/decisions.py"));
     assert!(!later("part/of.py"));
@@ -143,7 +135,7 @@ fn a_build_is_fresh_until_one_of_its_sources_changes() {
 fn a_source_from_the_future_is_named() {
     let lambda = LambdaFolder::new(PYTHON);
     lambda.write("main.py", "1");
-    let file = File::options().write(true).open(lambda.0.join("main.py")).unwrap();
+    let file = File::options().write(true).open(lambda.0.path().join("main.py")).unwrap();
     file.set_modified(SystemTime::now() + Duration::from_secs(3600)).unwrap();
     let error = lambda.build().unwrap_err();
     assert_eq!(error.to_string(), "`main.py` is newer than the build just made from it");
@@ -168,7 +160,7 @@ fn a_wasm_lambda_without_a_package_is_refused_with_help() {
     let error = lambda.build().unwrap_err();
     assert_eq!(
         error.to_string(),
-        format!("`{}` does not exist", lambda.0.join("Cargo.toml").display())
+        format!("`{}` does not exist", lambda.0.path().join("Cargo.toml").display())
     );
     assert!(error.help().unwrap().contains("cargo init --lib"));
 }
@@ -184,6 +176,30 @@ fn messages_are_optional_but_a_model_in_the_manifest_must_exist() {
     lambda.write("models/m.onnx", "1");
     lambda.build().unwrap();
     assert_eq!(lambda.files("build"), ["lambda.toml", "main.py", "models/m.onnx"]);
+}
+
+#[test]
+fn data_files_of_the_folder_are_built_in_under_their_paths_and_others_are_noted() {
+    let lambda = LambdaFolder::new(&PYTHON.replace("entry", "files = ['a.json', 'calib'], entry"));
+    lambda.write("main.py", "1");
+    let refused = |path: &str| {
+        let message = format!("{path}` (`files` of [lambda] in lambda.toml) does not exist");
+        let error = lambda.build().unwrap_err().to_string();
+        assert!(error.ends_with(&message), "{error}");
+    };
+    refused("/a.json");
+    lambda.write("a.json", "[1]");
+    fs::create_dir(lambda.0.path().join("calib")).unwrap();
+    refused("/calib/*");
+    lambda.write("calib/deep/front", "f = 2");
+    let noted = || left_out(lambda.0.path(), &Manifest::load(lambda.0.path()).unwrap());
+    assert_eq!(noted(), "");
+    (1..=7).for_each(|number| lambda.write(&format!("{number}.csv"), ""));
+    lambda.build().unwrap();
+    assert_eq!(lambda.files("build"), ["a.json", "calib/deep/front", "lambda.toml", "main.py"]);
+    assert_eq!(lambda.read("build/calib/deep/front").as_deref(), Some("f = 2"));
+    let listed = "`1.csv`, `2.csv`, `3.csv`, `4.csv`, `5.csv` and 2 more; add";
+    assert!(noted().starts_with(&format!("note: not built in: {listed}")), "{}", noted());
 }
 
 #[test]

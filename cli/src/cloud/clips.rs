@@ -20,10 +20,8 @@ use crate::render::table;
 
 /// Interval of looks whether a vehicle has sent a clip.
 const INTERVAL: Duration = Duration::from_secs(2);
-/// Path of the list of clips.
 const CLIPS: &str = "/v1/clips";
 
-/// Runs `gleaner clips`.
 pub(super) fn clips(args: &ClipsArgs) -> Result<Exit, Failure> {
     match &args.command {
         None => {

@@ -18,7 +18,6 @@ const FILE_MAX: ByteSize = ByteSize::kib(64);
 /// Interval of looks at the status.
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
 
-/// Runs `gleaner enrol`.
 pub(super) fn enrol(args: &EnrolArgs) -> Result<Exit, Failure> {
     let file = args.file.display();
     let unusable = |error: &dyn std::error::Error| {
@@ -62,7 +61,6 @@ pub(super) fn enrol(args: &EnrolArgs) -> Result<Exit, Failure> {
     }
 }
 
-/// Runs `gleaner unenrol`.
 pub(super) fn unenrol(args: &VehicleArgs) -> Result<Exit, Failure> {
     VehicleClient::new(args)?.delete("/v1/cloud")?;
     show(args.json, &json!({ "enrolled": false }), |_| {

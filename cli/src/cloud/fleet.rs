@@ -21,7 +21,6 @@ pub(crate) enum Change {
     Remove,
 }
 
-/// Runs `gleaner fleet`.
 pub(super) fn fleet(args: &FleetArgs) -> Result<Exit, Failure> {
     let (id, change) = match &args.command {
         None => return list(args.json),
@@ -69,7 +68,6 @@ fn list(json: bool) -> Result<Exit, Failure> {
     })
 }
 
-/// Runs `gleaner deploy --fleet`.
 pub(crate) fn deploy(args: &DeployArgs) -> Result<Exit, Failure> {
     let key = SecretKey::load(&args.key)?;
     let local = LocalRevision::load(args)?;

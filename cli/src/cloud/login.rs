@@ -11,7 +11,6 @@ use crate::account::{CloudAccount, CloudUrl};
 use crate::args::{ListArgs, LoginArgs};
 use crate::vehicle::VehicleClient;
 
-/// Runs `gleaner login`.
 pub(super) fn login(args: &LoginArgs) -> Result<Exit, Failure> {
     let url: CloudUrl = args.url.parse().map_err(|reason: String| {
         Failure::new(Exit::Usage, reason).with_help("the cloud shows its address when it starts")
@@ -32,7 +31,6 @@ pub(super) fn login(args: &LoginArgs) -> Result<Exit, Failure> {
     })
 }
 
-/// Reads a code from standard input.
 fn read_code() -> Result<String, Failure> {
     if stdin().is_terminal() {
         eprint!("code: ");
@@ -49,7 +47,6 @@ fn read_code() -> Result<String, Failure> {
     }
 }
 
-/// Runs `gleaner logout`.
 pub(super) fn logout(args: &ListArgs) -> Result<Exit, Failure> {
     // A file that cannot be read is removed, too.
     let account = CloudAccount::stored().unwrap_or(None);
@@ -78,7 +75,6 @@ pub(super) fn logout(args: &ListArgs) -> Result<Exit, Failure> {
     })
 }
 
-/// Runs `gleaner whoami`.
 pub(super) fn whoami(args: &ListArgs) -> Result<Exit, Failure> {
     let account = CloudAccount::load()?;
     let url = account.url.clone();

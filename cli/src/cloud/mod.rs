@@ -32,7 +32,6 @@ use crate::vehicle::VehicleClient;
 
 pub(crate) use fleet::{Change, change, deploy};
 
-/// Runs a command for the cloud.
 pub(crate) fn run(command: &CloudCommand) -> Result<Exit, Failure> {
     match command {
         CloudCommand::Cloud { arguments } => delegate::replace("gleaner-cloud", arguments),

@@ -10,7 +10,6 @@ use crate::args::{AuditArgs, UsersArgs, UsersCommand};
 use crate::render::table;
 use crate::vehicle::VehicleClient;
 
-/// Runs `gleaner users`.
 pub(super) fn users(args: &UsersArgs) -> Result<Exit, Failure> {
     let account = CloudAccount::load()?;
     let url = account.url.clone();
@@ -42,7 +41,6 @@ pub(super) fn users(args: &UsersArgs) -> Result<Exit, Failure> {
     }
 }
 
-/// Runs `gleaner audit`.
 pub(super) fn audit(args: &AuditArgs) -> Result<Exit, Failure> {
     let entries: Vec<AuditEntry> = list::first(&client()?, "/v1/audit", &[], args.last)?;
     show(args.json, &entries, |entries| {

@@ -18,7 +18,6 @@ const PART: usize = 500;
 /// must not keep the command busy. Each has some 32 MiB of records.
 const EMPTY_MAX: usize = 100_000;
 
-/// Runs `gleaner search`.
 pub(super) fn search(args: &SearchArgs) -> Result<Exit, Failure> {
     let (client, paint) = (client()?, Paint::of_stdout());
     end_with_reader();

@@ -8,7 +8,6 @@ use super::{client, date, list, show};
 use crate::args::{TokensArgs, TokensCommand};
 use crate::render::table;
 
-/// Runs `gleaner tokens`.
 pub(super) fn tokens(args: &TokensArgs) -> Result<Exit, Failure> {
     let client = client()?;
     match &args.command {

@@ -13,7 +13,6 @@ use crate::account::write_private;
 use crate::args::{NewVehicleArgs, VehiclesArgs, VehiclesCommand};
 use crate::render::{Paint, table};
 
-/// Runs `gleaner vehicles`.
 pub(super) fn vehicles(args: &VehiclesArgs) -> Result<Exit, Failure> {
     match &args.command {
         None => {
@@ -59,7 +58,6 @@ fn enrol(args: &NewVehicleArgs, json: bool) -> Result<Exit, Failure> {
     })
 }
 
-/// Returns the name of a state.
 pub(super) fn state(state: VehicleState) -> &'static str {
     match state {
         VehicleState::Invited => "invited",

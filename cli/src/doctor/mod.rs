@@ -14,16 +14,11 @@ use crate::args::DoctorArgs;
 use crate::render::json_line;
 use crate::stdout::print;
 
-/// Result of one check.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 struct Finding {
-    /// The checked thing.
     subject: &'static str,
-    /// Severity of the result.
     state: Severity,
-    /// The result, as text.
     detail: String,
-    /// A fix.
     #[serde(skip_serializing_if = "Option::is_none")]
     help: Option<String>,
 }

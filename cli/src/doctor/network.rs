@@ -4,7 +4,7 @@ use std::fs;
 use std::net::Ipv4Addr;
 use std::process::Command;
 
-use gleaner_base::Exit;
+use gleaner_base::{Exit, ignored_variables};
 use gleaner_parts::Parts;
 use nix::ifaddrs::getifaddrs;
 use nix::net::if_::InterfaceFlags;
@@ -42,6 +42,7 @@ pub(super) fn findings(parts: &Parts) -> Vec<Finding> {
         real_time(parts),
         discovery(&interfaces(), &routes, localhost_only),
         domain(std::env::var("ROS_DOMAIN_ID").ok().as_deref()),
+        middleware(),
     ]
 }
 
@@ -167,6 +168,15 @@ fn domain(id: Option<&str>) -> Finding {
             ),
         },
     }
+}
+
+fn middleware() -> Finding {
+    let ignored = ignored_variables().join(", ");
+    if ignored.is_empty() {
+        return Finding::ok("middleware", "DDS with multicast");
+    }
+    let help = "let the nodes use DDS with multicast, or a bridge to it";
+    Finding::warning("middleware", format!("DDS with multicast; ignored: {ignored}"), help)
 }
 
 /// Returns the interfaces in the network namespace of this process, each once.

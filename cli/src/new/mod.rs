@@ -26,70 +26,14 @@ const PACKAGES: [(&str, &str); 2] = [
     ("guest-sdk-rust/Cargo.toml", include_str!("files/sdk.toml")),
     ("rules/Cargo.toml", include_str!("files/rules.toml")),
 ];
-/// Names that a package cannot have: keywords, and names of existing crates.
-const NO_CRATES: &[&str] = &[
-    "abstract",
-    "alloc",
-    "as",
-    "async",
-    "await",
-    "become",
-    "box",
-    "break",
-    "const",
-    "continue",
-    "core",
-    "crate",
-    "do",
-    "dyn",
-    "else",
-    "enum",
-    "extern",
-    "false",
-    "final",
-    "fn",
-    "for",
-    "gen",
-    "gleaner-rules",
-    "gleaner-sdk",
-    "if",
-    "impl",
-    "in",
-    "let",
-    "loop",
-    "macro",
-    "match",
-    "mod",
-    "move",
-    "mut",
-    "override",
-    "priv",
-    "proc-macro",
-    "pub",
-    "ref",
-    "return",
-    "self",
-    "static",
-    "std",
-    "struct",
-    "super",
-    "test",
-    "trait",
-    "true",
-    "try",
-    "type",
-    "typeof",
-    "unsafe",
-    "unsized",
-    "use",
-    "virtual",
-    "where",
-    "while",
-    "yield",
-];
+/// Names that a package cannot have: keywords, and names of existing crates, separated by spaces.
+const NO_CRATES: &str = "\
+    abstract alloc as async await become box break const continue core crate do dyn else \
+    enum extern false final fn for gen gleaner-rules gleaner-sdk if impl in let loop macro \
+    match mod move mut override priv proc-macro pub ref return self static std struct super \
+    test trait true try type typeof unsafe unsized use virtual where while yield";
 const VERSION: &str = env!("CARGO_PKG_VERSION");
 
-/// Errors of `gleaner new`.
 #[derive(Debug, thiserror::Error)]
 enum NewError {
     #[error("`{}` does not end with a name", path.display())]
@@ -162,7 +106,7 @@ fn name_of(dir: &Path) -> Result<LambdaName, NewError> {
 
 /// Creates the folder atomically: fills a temporary folder beside it and renames that.
 fn make(dir: &Path, name: &LambdaName, kind: LambdaKind) -> Result<(), NewError> {
-    if kind == LambdaKind::Wasm && NO_CRATES.contains(&name.as_str()) {
+    if kind == LambdaKind::Wasm && NO_CRATES.split(' ').any(|it| it == name.as_str()) {
         return Err(NewError::CrateName { name: name.clone() });
     }
     if dir.symlink_metadata().is_ok() && !is_empty(dir) {

@@ -9,7 +9,6 @@ use gleaner_report::format::size;
 
 use super::Paint;
 
-/// Formats the report of `gleaner check`.
 pub(crate) fn check_report(report: &CheckReport, paint: Paint) -> String {
     let mut text = String::new();
     // Writing to a string cannot fail.

@@ -16,14 +16,18 @@ const EMPTY_WORDS: [&str; 7] =
 
 /// Formats the length of the drive, a table of its topics, and `[[input]]` tables.
 pub(crate) fn drive(drive: &DriveInfo) -> String {
-    let (Some(start), Some(end)) = (drive.start_ns, drive.end_ns) else {
+    let Some(start) = drive.start_ns else {
         return match &drive.damaged {
             Some(damaged) => format!("no messages: {}\n", visible(damaged)),
             None => "no messages\n".to_owned(),
         };
     };
     let (whole, rest) = (start.div_euclid(1_000_000_000), start.rem_euclid(1_000_000_000));
-    let mut text = format!("{:.3} s, starts at @{whole}.{rest:09}\n", seconds(end, start));
+    // Unknown for a truncated database, and after a message without a possible time.
+    let length = drive
+        .end_ns
+        .map_or("length unknown".to_owned(), |end| format!("{:.3} s", seconds(end, start)));
+    let mut text = format!("{length}, starts at @{whole}.{rest:09}\n");
     if !drive.parts.is_empty() {
         let parts = drive.parts.iter().map(|[from, to]| {
             format!("{:.1} to {:.1} s", seconds(*from, start), seconds(*to, start))
@@ -54,8 +58,9 @@ fn row(topic: &DriveTopicInfo, start_ns: i64) -> [String; 9] {
     let unknown = || "?".to_owned();
     let notes = [
         topic.picture.as_ref().map(picture_text),
-        (!topic.is_defined).then(|| "no definition: read as bytes only".to_owned()),
-        topic.unreadable.as_deref().map(visible),
+        topic.unreadable.as_deref().map(visible).or_else(|| {
+            (!topic.is_defined).then(|| "no definition: read as bytes only".to_owned())
+        }),
         (topic.layouts > 1).then(|| format!("{} layouts of its type", topic.layouts)),
         (topic.malformed > 0).then(|| format!("{} malformed, left out", grouped(topic.malformed))),
     ];
@@ -232,6 +237,8 @@ depth = 128                 # 1.3 s
 ";
         assert_eq!(drive(&seen(vec![topic("/imu/data"), unknown])), expected);
         assert_eq!(drive(&DriveInfo { start_ns: None, ..seen(Vec::new()) }), "no messages\n");
+        let endless = drive(&DriveInfo { end_ns: None, ..seen(Vec::new()) });
+        assert!(endless.starts_with("length unknown, starts at @1500000000.250000000\n"));
         let damaged = Some("cut off".to_owned());
         assert_eq!(
             drive(&DriveInfo { start_ns: None, damaged, ..seen(Vec::new()) }),

@@ -10,7 +10,6 @@ use gleaner_report::format::{counted, grouped};
 use super::live::table;
 use super::{Paint, mib};
 
-/// Formats the status of the ingress.
 pub(crate) fn ingress(status: &IngressStatus, paint: Paint) -> String {
     let mut text = String::new();
     // Writing to a string cannot fail.
@@ -67,7 +66,6 @@ fn row(topic: &IngressTopic) -> [String; 8] {
     ]
 }
 
-/// Writes the losses of the network.
 fn write_network(text: &mut String, network: &NetworkStatus, paint: Paint) -> fmt::Result {
     let losses = [
         (network.socket_drops, "dropped: socket buffer full"),

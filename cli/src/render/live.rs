@@ -21,7 +21,6 @@ pub(crate) fn live(live: &LiveStatus, paint: Paint) -> String {
     text
 }
 
-/// Formats the status of the recorder.
 pub(crate) fn recorder(status: &RecorderStatus, paint: Paint) -> String {
     let mut text = String::new();
     // Writing to a string cannot fail.

@@ -7,7 +7,9 @@ use gleaner_base::visible;
 use gleaner_lambda::{Clip, Decision, Fault, FaultKind, Trigger, TriggerKind};
 use gleaner_protocol::{LossOutcome, RecordingCounts, ReplaySummary, TopicReport, Verified};
 use gleaner_report::ResultsError;
-use gleaner_report::format::{counted, fault_kind, gist, grouped, seconds, three_digits};
+use gleaner_report::format::{
+    counted, fault_kind, gist, grouped, seconds, three_digits, without_numbers,
+};
 
 mod check_report;
 mod clips;
@@ -62,10 +64,11 @@ struct Burst {
     highest_score: Option<f64>,
 }
 
-/// Faults with the same kind and message.
+/// Faults with the same kind and message, but for its numbers.
 #[derive(Debug)]
 struct FaultGroup {
     kind: FaultKind,
+    key: String,
     message: String,
     count: u64,
     first_seconds: f64,
@@ -121,14 +124,13 @@ impl Digest {
 
     fn count(&mut self, fault: &Fault, first_seconds: f64) {
         let (kind, message) = (fault.kind, shown(gist(&fault.message)));
-        if let Some(cause) = self
-            .fault_groups
-            .iter_mut()
-            .find(|cause| cause.kind == kind && cause.message == message)
+        let key = without_numbers(&message);
+        if let Some(cause) =
+            self.fault_groups.iter_mut().find(|cause| cause.kind == kind && cause.key == key)
         {
             cause.count += 1;
         } else if self.fault_groups.len() < SHOWN {
-            self.fault_groups.push(FaultGroup { kind, message, count: 1, first_seconds });
+            self.fault_groups.push(FaultGroup { kind, key, message, count: 1, first_seconds });
         } else {
             self.other_faults += 1;
         }
@@ -163,7 +165,6 @@ pub(crate) fn shown(message: &str) -> String {
     }
 }
 
-/// Formats the summary of a replay.
 pub(crate) fn summary(
     summary: &ReplaySummary,
     digest: &Digest,
@@ -265,6 +266,9 @@ fn write_summary(
             "  {}",
             paint.dim(&format!("part of the drive: from {from_s:.3} s to {to_s:.3} s"))
         )?;
+    }
+    for model in &summary.models {
+        writeln!(text, "  {}", paint.dim(&visible(model)))?;
     }
     write!(text, "  {} wakes/s", grouped(summary.wakes_per_s.round() as u64))?;
     if summary.wall_s > 0.0 && span_s > 0.0 {

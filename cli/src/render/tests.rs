@@ -33,6 +33,7 @@ fn replay() -> ReplaySummary {
         decode_s: 0.1,
         wakes_per_s: 2400.4,
         peak_rss_bytes: 12 << 20,
+        models: vec!["model `det`: rten 0.24".to_owned()],
         topics: vec![TopicReport {
             name: "imu".to_owned(),
             topic: "/imu/data".to_owned(),
@@ -88,7 +89,7 @@ fn a_summary_has_triggers_with_times_speed_and_files() {
     assert_eq!(
         summary(&replay(), &digest, &[], PLAIN),
         "brake-dark 0.1.0 (wasm): 1 trigger in 1,200 wakes, 40.0 s of drive\n    \
-            10.810 s  brake-dark  1.46\n  \
+            10.810 s  brake-dark  1.46\n  model `det`: rten 0.24\n  \
           2,400 wakes/s (80x real time), total run time 0.400 s (25 % decoding), peak memory 12.0 MiB\n  \
           out/demo: decisions.jsonl, log.jsonl, summary.json\n"
     );
@@ -156,20 +157,20 @@ fn faults_are_grouped_by_their_most_informative_line() {
     let traceback =
         "Traceback (most recent call last):\n  File \"main.py\", line 3\nValueError: no\n";
     let faults =
-        [(500, FaultKind::Trap, "unreachable\nat f"), (600, FaultKind::Exception, traceback)];
+        [(500, FaultKind::Trap, "a.rs:1:2: no 7\nat f"), (600, FaultKind::Exception, traceback)];
     let mut decisions: Vec<_> =
         faults.map(|(at, kind, message)| decision(at, None, Some((kind, message)))).into();
-    decisions.push(decision(700, None, Some((FaultKind::Trap, "unreachable\nat g"))));
+    decisions.push(decision(700, None, Some((FaultKind::Trap, "a.rs:1:2: no 18\nat g"))));
     let text = summary(&ReplaySummary { faults: 3, ..replay() }, &digest(decisions), &[], PLAIN);
     assert!(
-        text.contains("  3 faults\n     0.500 s  2x trap: unreachable\n     0.600 s  1x exception: ValueError: no\n"),
+        text.contains("  3 faults\n     0.500 s  2x trap: a.rs:1:2: no 7\n     0.600 s  1x exception: ValueError: no\n"),
         "{text}"
     );
 }
 
 #[test]
 fn faults_with_many_messages_are_bounded() {
-    let message = |n: i64| format!("message {n}");
+    let message = |n: i64| "m".repeat(n as usize);
     let digest = digest(
         (0..50).map(|n| decision(n, None, Some((FaultKind::HostCall, &message(n))))).collect(),
     );

@@ -27,13 +27,13 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
     gleaner_supervisor::run(lambdas, &spec(args, signing), &mut screen, &stop)
 }
 
-/// Returns what the lambdas share.
 fn spec(args: &RunArgs, signing: Option<ClipSigning>) -> RunSpec {
     let real_time = args.real_time.then(|| "--real-time".into());
     RunSpec {
         clips: lambdas::out(args),
         vehicle: args.vehicle.clone(),
         drives: args.drive.clone(),
+        merge: args.merge,
         rate: args.rate,
         network: args.network.to_args().chain(real_time).collect(),
         largest: 0,

@@ -31,9 +31,7 @@ pub(super) struct Screen {
     warned: HashSet<String>,
     /// Last status of each running lambda, formatted, by its name.
     lambdas: BTreeMap<String, String>,
-    /// Last status of the recorder, formatted.
     recorder: String,
-    /// Last status of the ingress, formatted.
     ingress: String,
     /// Set while there is no ingress, whose status shows the statistics otherwise.
     lacks_ingress: bool,
@@ -63,7 +61,6 @@ impl Screen {
         }
     }
 
-    /// Prints a report with `--json`.
     fn report(&self, report: &impl Serialize) {
         if self.json {
             self.out(&render::json_line(report));
@@ -91,13 +88,11 @@ impl Screen {
         self.print(&render::clip_line(clip, self.paint));
     }
 
-    /// Prints the final status of the recorder.
     fn recorder_ended(&mut self, status: &RecorderStatus) {
         self.recorder.clear();
         self.print(&render::recorder(status, self.paint));
     }
 
-    /// Updates the status of a lambda.
     fn live(&mut self, lambda: &str, live: &LiveStatus) {
         self.warn_of_missing_writers(live);
         self.lambdas.insert(lambda.to_owned(), render::live(live, self.paint));
@@ -115,7 +110,6 @@ impl Screen {
         self.show();
     }
 
-    /// Shows the statistics.
     fn show(&mut self) {
         if !self.stats {
             return;
@@ -148,7 +142,6 @@ impl Screen {
         }
     }
 
-    /// Prints the final status of a lambda.
     fn ended(&mut self, lambda: &str, live: &LiveStatus) {
         self.lambdas.remove(lambda);
         self.clear();

@@ -33,10 +33,8 @@ const ANSWER_TIMEOUT: Duration = Duration::from_secs(10);
 /// Longest answer, and longest line of one: that of a thousand lambdas takes some MiB.
 const ANSWER_MAX: ByteSize = ByteSize::mib(64);
 
-/// The body of a request.
 type Content = Either<Full<Bytes>, FileBody>;
 
-/// A program that answers requests.
 enum Endpoint {
     /// The orchestrator of this machine, at its socket.
     Orchestrator(PathBuf),
@@ -68,7 +66,6 @@ impl VehicleClient {
         }
     }
 
-    /// Creates a client of a cloud.
     pub(crate) fn of_cloud(account: CloudAccount) -> Result<Self, Failure> {
         Self::to(Endpoint::Cloud(account), "/v1".to_owned())
     }
@@ -96,7 +93,6 @@ impl VehicleClient {
         }
     }
 
-    /// Returns the status of the vehicle.
     pub(crate) fn status(&self) -> Result<VehicleStatus, Failure> {
         self.get("/v1/status")
     }
@@ -174,7 +170,6 @@ impl VehicleClient {
         })
     }
 
-    /// Sends a file.
     pub(super) fn put_file(&self, path: &str, file: std::fs::File) -> Result<(), Failure> {
         self.runtime.block_on(async {
             let body = Either::Right(FileBody::new(file));

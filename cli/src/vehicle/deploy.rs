@@ -48,7 +48,6 @@ pub(crate) struct Former<'a> {
     pub(crate) grants: &'a GrantStatus,
 }
 
-/// Runs `gleaner deploy`.
 pub(crate) fn deploy(args: &DeployArgs) -> Result<Exit, Failure> {
     let key = SecretKey::load(&args.key)?;
     let local = LocalRevision::load(args)?;
@@ -75,7 +74,6 @@ pub(crate) fn change(args: &ChangeArgs, change: &str) -> Result<Exit, Failure> {
     }
 }
 
-/// Runs `gleaner remove`.
 pub(crate) fn remove(args: &ChangeArgs) -> Result<Exit, Failure> {
     let client = VehicleClient::new(&args.vehicle)?;
     client.delete(&path(&args.id)?)?;

@@ -16,7 +16,6 @@ use crate::stdout::print;
 pub(super) const NO_DEPLOYMENTS: &str =
     "nothing is deployed: `gleaner deploy --local DIR --key FILE`";
 
-/// Runs `gleaner status`.
 pub(crate) fn status(args: &StatusArgs) -> Result<Exit, Failure> {
     let status = VehicleClient::of(&args.vehicle, &args.on)?.status()?;
     print(&match args.vehicle.json {
@@ -26,7 +25,6 @@ pub(crate) fn status(args: &StatusArgs) -> Result<Exit, Failure> {
     Ok(Exit::Ok)
 }
 
-/// Formats the status.
 pub(super) fn text(status: &VehicleStatus, paint: Paint) -> String {
     let labels = status.labels.iter().map(|(name, value)| format!("{name}={}", visible(value)));
     let labels = labels.collect::<Vec<_>>().join(" ");
@@ -126,7 +124,6 @@ pub(super) fn state(deployment: &DeploymentStatus) -> &'static str {
     }
 }
 
-/// Returns the version that runs.
 pub(super) fn version(deployment: &DeploymentStatus) -> String {
     let fallback = deployment.fallback.as_ref().filter(|_| deployment.runs_fallback);
     let mark = if fallback.is_some() { " (fallback)" } else { "" };

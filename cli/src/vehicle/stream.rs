@@ -11,7 +11,6 @@ use crate::args::{LogsArgs, StreamArgs};
 use crate::render::{Paint, time_of_day};
 use crate::stdout::{end_with_reader, print};
 
-/// Runs `gleaner logs`.
 pub(crate) fn logs(args: &LogsArgs) -> Result<Exit, Failure> {
     if args.id.parse::<gleaner_lambda::manifest::ItemName>().is_err() {
         let id = gleaner_base::excerpt(&args.id);
@@ -21,7 +20,6 @@ pub(crate) fn logs(args: &LogsArgs) -> Result<Exit, Failure> {
     show(&format!("/v1/lambdas/{}/records", args.id), &args.stream)
 }
 
-/// Runs `gleaner events`.
 pub(crate) fn events(args: &StreamArgs) -> Result<Exit, Failure> {
     show("/v1/events", args)
 }

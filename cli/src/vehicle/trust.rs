@@ -15,7 +15,6 @@ use crate::args::{TrustArgs, TrustCommand, TrustInstallArgs};
 use crate::render::json_line;
 use crate::stdout::print;
 
-/// Runs `gleaner trust`.
 pub(crate) fn trust(command: &TrustCommand) -> Result<Exit, Failure> {
     match command {
         TrustCommand::New(args) => new(args),

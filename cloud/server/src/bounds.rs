@@ -11,7 +11,6 @@ const LINES: RateLimit = RateLimit::of(1.0 / 60.0, 1.0);
 /// The numbers of connections or streams that a bound has ended and refused, since the start.
 #[derive(Debug)]
 pub(crate) struct BoundCounts {
-    /// The things that are bounded.
     things: &'static str,
     state: Mutex<CountedEnds>,
 }

@@ -49,7 +49,6 @@ type ConnectionsOfAll = HashMap<ClientNetwork, BTreeMap<u64, Arc<ClientState>>>;
 
 #[derive(Debug, Default)]
 struct ClientState {
-    /// Requests that are being answered.
     requests: AtomicUsize,
     end: Notify,
 }
@@ -135,7 +134,6 @@ impl OpenClient {
         self.state.requests.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// Ends a request.
     pub(crate) fn end_request(&self) {
         self.state.requests.fetch_sub(1, Ordering::Relaxed);
     }

@@ -23,7 +23,6 @@ pub(crate) struct CloudError {
     failure: Failure,
 }
 
-/// A result of this crate.
 pub(crate) type CloudResult<T> = Result<T, CloudError>;
 
 impl CloudError {
@@ -71,7 +70,6 @@ impl CloudError {
         self.status
     }
 
-    /// Adds the cause.
     pub(crate) fn because(mut self, cause: impl ToString) -> Self {
         self.failure.causes.push(cause.to_string());
         self

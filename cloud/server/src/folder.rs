@@ -35,7 +35,6 @@ impl FolderLock {
     }
 }
 
-/// The data folder.
 #[derive(Debug, Clone)]
 pub(crate) struct DataFolder(PathBuf);
 

@@ -17,7 +17,6 @@ use crate::transfer::body_of;
 /// Number of lists, of a thousand names each, that the removal of a file takes at most.
 const LISTS_MAX: usize = 100;
 
-/// A place of files.
 #[derive(Debug)]
 pub(crate) struct FilePlace {
     /// Folder in which files are received, and stay without a bucket.

@@ -241,7 +241,6 @@ impl CloudServer {
     }
 }
 
-/// Returns the entrance of people.
 fn people_entrance(
     listener: TcpListener,
     cloud: &Arc<Cloud>,
@@ -259,7 +258,6 @@ fn people_entrance(
     }
 }
 
-/// Returns the entrance of vehicles.
 fn vehicles_entrance(
     listener: TcpListener,
     cloud: &Arc<Cloud>,

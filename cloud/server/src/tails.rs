@@ -130,7 +130,6 @@ pub(crate) async fn deliver(cloud: &Cloud) -> CloudResult<()> {
 mod tests {
     use std::time::Instant;
 
-    use tempfile::TempDir;
     use tokio::sync::mpsc;
 
     use super::*;
@@ -139,8 +138,7 @@ mod tests {
 
     #[tokio::test]
     async fn however_many_readers_come_leases_are_stored_a_few_times_in_a_second() {
-        let folder = TempDir::new().unwrap();
-        let mut cloud = crate::people::tests::cloud(&folder).await;
+        let (_folder, mut cloud) = crate::people::tests::cloud().await;
         let (queue, mut hints) = mpsc::channel(1000);
         Arc::get_mut(&mut cloud).unwrap().hub = Hub::new(Bus::of_queue(queue));
         let begun = Instant::now();

@@ -153,16 +153,7 @@ impl DriverInstance {
     fn publish(&mut self, topic: &str, cdr: &[u8], endian: Endian) {
         self.sent += 1;
         let (at_ns, seq) = (self.sent as i64 * 1_000_000, self.sent);
-        let meta = SampleMeta {
-            at_ns,
-            publish_ns: at_ns,
-            writer: Guid::default(),
-            seq,
-            endian,
-            options: [0; 2],
-            layout: 0,
-            is_latched: false,
-        };
+        let meta = SampleMeta { endian, ..SampleMeta::new(at_ns, Guid::default(), seq) };
         self.transport.publish(topic, &meta, cdr).expect("the topic was added");
     }
 

@@ -50,9 +50,9 @@ class InputState:
         try:
             return path.number(self.message(cell))
         except NotANumber:
-            raise DataError(
-                f"field `{path.text}` of `{self.declared.type_name}` is not a number", "wrong-field"
-            ) from None
+            of_type = f"field `{path.text}` of `{self.declared.type_name}`"
+            why = f"{of_type} is not a number; `get` reads it"
+            raise DataError(why, "wrong-field") from None
         except MissingElement as error:
             raise self.malformed(str(error)) from None
 

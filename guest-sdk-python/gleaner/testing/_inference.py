@@ -211,8 +211,9 @@ class Model:
         table = _running()
         declared = table.declared.get(name)
         if declared is None:
+            way_out = "" if table.declared else "; add a [[model]] of this name"
             raise InferenceError(
-                f"no model `{str(name)[:64]}`; the manifest has {quoted(table.declared)}",
+                f"no model `{str(name)[:64]}`; the manifest has {quoted(table.declared)}{way_out}",
                 "no-such-model",
             )
         answers = table.answers.get(name)

@@ -118,7 +118,7 @@ def _manifest(file: str, entries: Mapping[str, Any], overrides: Mapping[str, Any
         entries,
         ["lambda", "schedule", "input", "model", "record", "limits", "demand", "config"],
     )
-    known = ["name", "version", "kind", "entry", "description", "deterministic"]
+    known = ["name", "version", "kind", "entry", "files", "description", "deterministic"]
     about = Table(
         file, "[lambda]", root.need("lambda", "[lambda] with name, version, kind and entry"), known
     )

@@ -101,8 +101,6 @@ impl FirstSamples {
 
 #[cfg(test)]
 mod tests {
-    use gleaner_messages::Endian;
-
     use super::*;
 
     const SECOND: i64 = 1_000_000_000;
@@ -112,17 +110,7 @@ mod tests {
         guid[..2].copy_from_slice(&writer.to_be_bytes());
         // The writer has another clock.
         let publish_ns = at_ns - 1_000 * SECOND;
-        let (endian, options) = (Endian::Little, [0; 2]);
-        SampleMeta {
-            at_ns,
-            publish_ns,
-            writer: Guid(guid),
-            seq,
-            endian,
-            options,
-            layout: 0,
-            is_latched: false,
-        }
+        SampleMeta { publish_ns, ..SampleMeta::new(at_ns, Guid(guid), seq) }
     }
 
     /// The count after samples `first..first + count` of a writer, at 100 Hz from `at_ns` on, and a

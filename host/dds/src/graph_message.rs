@@ -248,16 +248,10 @@ mod tests {
             for (readers, writers) in [(0, 0), (1, 0), (0, 1), (9, 40)] {
                 for (distro, humble) in [(Distro::Humble, true), (Distro::Newer, false)] {
                     let cdr = encode(&entry(name, readers, writers), distro);
-                    assert_eq!(
-                        plausible(&cdr, Endian::Little, Distro::Humble),
-                        humble,
-                        "{name} {readers} {writers}"
-                    );
-                    assert_eq!(
-                        plausible(&cdr, Endian::Little, Distro::Newer),
-                        !humble,
-                        "{name} {readers} {writers}"
-                    );
+                    for (distro, expected) in [(Distro::Humble, humble), (Distro::Newer, !humble)] {
+                        let found = plausible(&cdr, Endian::Little, distro);
+                        assert_eq!(found, expected, "{name} {readers} {writers}");
+                    }
                 }
             }
         }
@@ -269,10 +263,8 @@ mod tests {
             for (namespace, full) in [("/", "/camera"), ("/front/left", "/front/left/camera")] {
                 let entry = OwnNode { namespace: namespace.to_owned(), ..entry("camera", 3, 2) };
                 let found = nodes(&encode(&entry, distro), Endian::Little, distro).unwrap();
-                assert_eq!(
-                    found,
-                    [RemoteNode { name: full.to_owned(), writers: vec![[2; 16]; 2] }]
-                );
+                let expected = [RemoteNode { name: full.to_owned(), writers: vec![[2; 16]; 2] }];
+                assert_eq!(found, expected);
             }
         }
     }
@@ -296,10 +288,8 @@ mod tests {
             (Some(Newer), vec![Humble]),
             (Some(Newer), vec![Newer, Humble]),
         ] {
-            assert!(
-                matches!(listing(configured, &seen), Listing::Out(_)),
-                "{configured:?} {seen:?}"
-            );
+            let found = listing(configured, &seen);
+            assert!(matches!(found, Listing::Out(_)), "{configured:?} {seen:?}");
         }
     }
 

@@ -199,29 +199,27 @@ impl Dds {
     }
 
     /// The hash (RIHS01) of the layout in which a topic is received: that of its subscription, else
-    /// the one of the definition at hand, else any of those that its writers announce. `None` if
-    /// they announce none, as up to Humble.
+    /// that of the definition at hand if writers announce it, else any that they announce. `None`
+    /// if they announce none, as up to Humble.
     pub fn type_hash(&self, topic: &str) -> Option<String> {
-        let type_name = self.type_of(topic).ok()?;
-        let listed = discovery::topics(&self.participant, None, &[]);
-        let is_it =
-            |shown: &DomainTopic| shown.topic == topic && same_type(&shown.type_name, &type_name);
-        let found = listed.into_iter().find(|listed| is_it(&listed.shown));
-        let announced = found.map(|listed| listed.type_hashes).unwrap_or_default();
-        self.layout_of(topic, &type_name, &announced, &mut lock(&self.definitions))
+        self.hash_as(topic, &self.type_of(topic).ok()?)
     }
 
-    /// Fixes the layout of a subscription to that of the definitions that its readers use: samples
-    /// of writers that announce another one are left out.
-    ///
-    /// # Errors
-    ///
-    /// The hash to which a writer, or an earlier call, has fixed it.
-    pub fn fix_layout(&self, subscription: Subscription, type_hash: &str) -> Result<(), String> {
-        match self.subscriptions.get(&subscription.0).map(|(_, status)| &status.layout) {
-            Some(layout) if !layout.fix(type_hash) => Err(layout.get().unwrap_or_default().into()),
-            _ => Ok(()),
-        }
+    /// As [`type_hash`](Self::type_hash), of a topic that is received as this type.
+    fn hash_as(&self, topic: &str, type_name: &str) -> Option<String> {
+        let listed = discovery::topics(&self.participant, None, &[]);
+        let is_it =
+            |shown: &DomainTopic| shown.topic == topic && same_type(&shown.type_name, type_name);
+        let found = listed.into_iter().find(|listed| is_it(&listed.shown));
+        let announced = found.map(|listed| listed.type_hashes).unwrap_or_default();
+        self.layout_of(topic, type_name, &announced, &mut lock(&self.definitions))
+    }
+
+    /// The layout to which a subscription of a topic is fixed.
+    fn fixed_layout(&self, topic: &str, type_name: &str) -> Option<&str> {
+        let is_it = |spec: &TopicSpec| spec.topic == topic && same_type(&spec.type_name, type_name);
+        let mut subscribed = self.subscriptions.values().filter(|(spec, _)| is_it(spec));
+        subscribed.find_map(|(_, status)| status.layout.get())
     }
 
     fn layout_of(
@@ -231,9 +229,7 @@ impl Dds {
         announced: &[String],
         definitions: &mut DefinitionsCache,
     ) -> Option<String> {
-        let is_it = |spec: &TopicSpec| spec.topic == topic && same_type(&spec.type_name, type_name);
-        let mut subscribed = self.subscriptions.values().filter(|(spec, _)| is_it(spec));
-        if let Some(fixed) = subscribed.find_map(|(_, status)| status.layout.get()) {
+        if let Some(fixed) = self.fixed_layout(topic, type_name) {
             return Some(fixed.to_owned());
         }
         let at_hand = definitions.hash_at_hand(type_name);
@@ -287,9 +283,8 @@ impl Transport for Dds {
                 type_hash: layout,
                 topic,
                 type_name,
-                messages: None,
                 offered_qos,
-                other_definitions: Vec::new(),
+                ..DiscoveredTopic::default()
             }
         };
         // A topic that is only read delivers nothing, and its readers may have another type.
@@ -304,10 +299,9 @@ impl Transport for Dds {
         sink: Arc<dyn Sink>,
     ) -> Result<Subscription, TransportError> {
         let at_hand = lock(&self.definitions).hash_at_hand(&spec.type_name);
-        // Readers that come before all writers use the definition at hand.
-        let fixed = self.type_hash(&spec.topic).is_none().then(|| at_hand.clone()).flatten();
         let layout = TopicLayout::new(at_hand);
-        if let Some(fixed) = fixed {
+        // That of an earlier subscription, else one that writers announce.
+        if let Some(fixed) = self.hash_as(&spec.topic, &spec.type_name) {
             layout.fix(&fixed);
         }
         let status = Arc::new(SubscriptionStatus { layout, ..SubscriptionStatus::default() });
@@ -369,6 +363,10 @@ impl LiveSource for Dds {
         };
         let dead = dead.or_else(|| ended.then(|| "the receive thread has ended".to_owned()));
         Health { network: Some(network), dead }
+    }
+
+    fn layout(&self, subscription: Subscription) -> Option<String> {
+        self.subscriptions.get(&subscription.0)?.1.layout.get().map(str::to_owned)
     }
 
     /// The reader, its entry in the graph and its status are gone as soon as the receive thread

@@ -257,16 +257,10 @@ mod tests {
     fn invalid_values_are_refused_by_name() {
         for domain in ["233", "-1", "one", "1 2", "99999999999"] {
             let error = read(&[("ROS_DOMAIN_ID", domain)]).unwrap_err().to_string();
-            assert_eq!(
-                error,
-                format!("ROS_DOMAIN_ID is `{domain}`; it may be a number from 0 to 232")
-            );
+            let expected = format!("ROS_DOMAIN_ID is `{domain}`; it may be a number from 0 to 232");
+            assert_eq!(error, expected);
         }
-        assert!(
-            read(&[("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")])
-                .unwrap_err()
-                .to_string()
-                .contains("`OFF`")
-        );
+        let refused = read(&[("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")]).unwrap_err();
+        assert!(refused.to_string().contains("`OFF`"));
     }
 }

@@ -228,10 +228,8 @@ mod tests {
         ));
         assert!(names.contains("  reliability: best_effort\n  durability: transient_local\n"));
         let numbers = as_rosbag2(&[&mine], Some(Distro::Humble)).unwrap();
-        assert!(
-            numbers.starts_with("- history: 3\n  depth: 0\n  reliability: 1\n  durability: 2\n"),
-            "{numbers}"
-        );
+        let expected = "- history: 3\n  depth: 0\n  reliability: 1\n  durability: 2\n";
+        assert!(numbers.starts_with(expected), "{numbers}");
         assert_eq!(as_rosbag2(&[], None), None);
         let many = vec![&mine; 10_000];
         assert!(as_rosbag2(&many, None).unwrap().len() < 65_536);

@@ -180,7 +180,7 @@ impl TopicReader {
                 Ok(Some(change)) => {
                     let writer = Guid(change.writer_guid.to_bytes());
                     let seq = u64::try_from(i64::from(change.sequence_number)).unwrap_or(0).max(1);
-                    let other = self.type_check.skips(
+                    let layout = self.type_check.layout_of(
                         context.participant,
                         writer,
                         &self.type_name,
@@ -188,10 +188,10 @@ impl TopicReader {
                     );
                     let is_new = change.receive_instant >= self.not_before
                         && !self.read_before.has(writer, seq);
-                    if !other && is_new {
+                    if let Some(layout) = layout.filter(|_| is_new) {
                         let publish_ns =
                             change.source_timestamp().map_or(change.sample.at_ns, nanoseconds);
-                        self.deliver(context, writer, seq, publish_ns, change.sample);
+                        self.deliver(context, (writer, seq, layout), publish_ns, change.sample);
                     }
                 }
                 Err(ReadError::Deserialization { reason }) => self.note_malformed(&reason),
@@ -214,8 +214,7 @@ impl TopicReader {
     fn deliver(
         &mut self,
         context: &ReceiveContext<'_>,
-        writer: Guid,
-        seq: u64,
+        (writer, seq, layout): (Guid, u64, u16),
         publish_ns: i64,
         raw: Raw,
     ) {
@@ -229,14 +228,10 @@ impl TopicReader {
             );
         }
         let meta = SampleMeta {
-            at_ns: raw.at_ns,
             publish_ns,
-            writer,
-            seq,
             endian: raw.endian,
-            options: [0; 2],
-            layout: 0,
-            is_latched: false,
+            layout,
+            ..SampleMeta::new(raw.at_ns, writer, seq)
         };
         if let Some(before) = &mut self.before_match {
             before.note(&meta);

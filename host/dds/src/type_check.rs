@@ -1,7 +1,7 @@
 //! Decides which writers of a topic are received: those of its type, in one layout, that its reader
 //! can match.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::HashMap;
 use std::sync::OnceLock;
 
 use rustdds::DomainParticipant;
@@ -35,6 +35,11 @@ impl LeftOut {
             "XCDR1" => None,
             _ => Some(Self::Encoding),
         }
+    }
+
+    /// The hash of the layout that a writer announces, if readers can match it.
+    pub(super) fn layout_of(offer: &Offer) -> Option<&str> {
+        offer.type_hash.as_deref().filter(|_| Self::unmatched(offer).is_none())
     }
 
     /// A warning about a writer of `topic`: its cause, and a sentence.
@@ -118,7 +123,8 @@ impl TopicLayout {
 /// The writers of one topic.
 #[derive(Debug, Default)]
 pub(super) struct TypeCheck {
-    received: HashSet<Guid>,
+    /// Each with the number of its layout: 1 if it announces one, else 0.
+    received: HashMap<Guid, u16>,
     left_out: HashMap<Guid, LeftOut>,
     /// Samples of another type, and of another layout.
     skipped: [u64; 2],
@@ -134,7 +140,7 @@ impl TypeCheck {
         layout: &TopicLayout,
     ) -> (Vec<&'o Offer>, Vec<(&'o Offer, LeftOut)>) {
         let of_type = offers.iter().filter(|offer| offer.type_name == type_name);
-        let announced = of_type.filter_map(|offer| offer.type_hash.as_deref());
+        let announced = of_type.filter_map(|offer| LeftOut::layout_of(offer));
         if let Some(hash) = TopicLayout::choose(layout.at_hand.as_deref(), announced) {
             layout.fix(hash);
         }
@@ -145,7 +151,7 @@ impl TypeCheck {
                 Some(why) => left_out.push((*offer, why)),
             }
         }
-        self.received = received.iter().map(|offer| offer.guid).collect();
+        self.received = received.iter().map(|offer| (offer.guid, number_of(offer))).collect();
         if self.left_out.len() > MOST_LEFT_OUT {
             self.left_out.clear();
         }
@@ -154,28 +160,28 @@ impl TypeCheck {
         (received, left_out)
     }
 
-    /// Returns whether a sample of `writer` is skipped. A writer that is new since the last
-    /// [`note`](Self::note) is looked up once.
-    pub(super) fn skips(
+    /// Returns the number of the layout of a sample of `writer`; `None` if it is skipped. A writer
+    /// that is new since the last [`note`](Self::note) is looked up once.
+    pub(super) fn layout_of(
         &mut self,
         participant: &DomainParticipant,
         writer: Guid,
         type_name: &str,
         layout: &TopicLayout,
-    ) -> bool {
-        if !self.received.contains(&writer) && !self.left_out.contains_key(&writer) {
+    ) -> Option<u16> {
+        if !self.received.contains_key(&writer) && !self.left_out.contains_key(&writer) {
             let writers = participant.discovered_writers();
             let found = writers.iter().map(discovery::offer).find(|offer| offer.guid == writer);
-            match found.and_then(|offer| left_out_for(&offer, type_name, layout)) {
+            match found.as_ref().and_then(|offer| left_out_for(offer, type_name, layout)) {
                 Some(why) => drop(self.left_out.insert(writer, why)),
-                None => drop(self.received.insert(writer)),
+                None => drop(self.received.insert(writer, found.as_ref().map_or(0, number_of))),
             }
         }
-        let why = self.left_out.get(&writer);
-        if let Some(why) = why {
-            self.skipped[usize::from(*why == LeftOut::Layout)] += 1;
-        }
-        why.is_some()
+        let Some(why) = self.left_out.get(&writer) else {
+            return self.received.get(&writer).copied();
+        };
+        self.skipped[usize::from(*why == LeftOut::Layout)] += 1;
+        None
     }
 
     /// Warnings with the numbers of skipped samples of `topic`.
@@ -188,10 +194,36 @@ impl TypeCheck {
     }
 }
 
+fn number_of(offer: &Offer) -> u16 {
+    u16::from(offer.type_hash.is_some())
+}
+
 fn left_out_for(offer: &Offer, type_name: &str, layout: &TopicLayout) -> Option<LeftOut> {
     if offer.type_name != type_name {
         return Some(LeftOut::Type);
     }
     let is_of_it = || offer.type_hash.as_deref().is_none_or(|hash| layout.fix(hash));
     LeftOut::unmatched(offer).or_else(|| (!is_of_it()).then_some(LeftOut::Layout))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn writers_that_no_reader_can_match_do_not_fix_the_layout() {
+        let offer = |entity: u8, hash: &str| Offer {
+            guid: Guid([entity; 16]),
+            topic: "rt/tyre".to_owned(),
+            type_name: "Tyre".to_owned(),
+            qos: rustdds::QosPolicyBuilder::new().build(),
+            type_hash: Some(hash.to_owned()),
+        };
+        let (keyed, plain) = (offer(WITH_KEY, "RIHS01_1"), offer(3, "RIHS01_2"));
+        let (mut check, layout) = (TypeCheck::default(), TopicLayout::new(None));
+        let (received, left_out) = check.note(&[&keyed, &plain], "Tyre", &layout);
+        assert_eq!(layout.get(), Some("RIHS01_2"));
+        assert_eq!(received[0].guid, plain.guid);
+        assert!(matches!(left_out[..], [(offer, LeftOut::Key)] if offer.guid == keyed.guid));
+    }
 }

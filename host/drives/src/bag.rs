@@ -105,7 +105,7 @@ fn by_name(folder: &Path) -> Result<Bag, ReplayError> {
         return Err(ReplayError::NoBag { path: folder.to_owned() });
     }
     let remark = Some(format!(
-        "no metadata.yaml: its {} files are read in the order of their names",
+        "no metadata.yaml: whether its {} files are one drive depends on their numbers and times",
         files.len()
     ));
     Ok(Bag { files, remark, ..Bag::default() })

@@ -1,18 +1,28 @@
 //! The topics of a drive: the channels of all its files, merged by name, type and layout.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 use std::sync::{Arc, OnceLock};
 
 use tracing::warn;
 
 use super::file::{ChannelInfo, Contents};
+use gleaner_base::excerpt;
 use gleaner_base::text::nearest;
-use gleaner_messages::{Definitions, Sources, SourcesError};
-use gleaner_transport::{DiscoveredTopic, TopicSpec, TransportError, same_type};
+use gleaner_messages::type_description::type_hash;
+use gleaner_messages::{Definitions, Sources, SourcesError, short_name};
+use gleaner_transport::{DiscoveredTopic, TopicSpec, TransportError, latched_depth, same_type};
 
-/// Most different definitions of one topic; each is compared with the others.
-const DEFINITIONS_MAX: usize = 64;
+/// Most layouts of one topic.
+const LAYOUTS_MAX: usize = 64;
+
+/// Most types that a warning names.
+const NAMED: usize = 3;
+
+/// The reason why messages of a channel are not read that states another hash of its type.
+const OTHER_HASH: &str = "a channel states a type hash that is not that of its definition, so its \
+    writer had another version of the type; record it where the messages of the writer are \
+    installed";
 
 /// A channel of a drive.
 #[derive(Copy, Clone)]
@@ -26,6 +36,7 @@ pub(super) struct DriveChannel {
 }
 
 /// A topic of all files, as far as it has one type.
+#[derive(Default)]
 struct DriveTopic {
     type_name: String,
     layouts: Layouts,
@@ -48,82 +59,108 @@ struct DriveTopic {
     definitions: OnceLock<Arc<Definitions>>,
 }
 
-/// The layouts of one type on one topic. Definitions that differ only in comments and constants
-/// have one layout.
+/// The layouts of one type on one topic.
 #[derive(Default)]
 struct Layouts {
     /// The definitions of each layout, as the first channel has them, in the order of channels.
     texts: Vec<Arc<str>>,
-    /// The same, parsed, once there are different texts; `None` for malformed ones.
-    parsed: Vec<Option<Definitions>>,
-    /// All different texts, each with the number of its layout.
-    known: Vec<(Arc<str>, u16)>,
-    /// Set beyond [`DEFINITIONS_MAX`].
+    /// The digest of each layout; `None` for malformed definitions.
+    digests: Vec<Option<[u8; 32]>>,
+    /// Set beyond [`LAYOUTS_MAX`].
     is_full: bool,
 }
 
 impl Layouts {
-    /// Returns the number of the layout of `text`.
-    fn number(&mut self, type_name: &str, text: &Arc<str>) -> u16 {
-        if let Some((_, number)) = self.known.iter().find(|(known, _)| known == text) {
-            return *number;
-        }
-        if self.known.len() >= DEFINITIONS_MAX {
+    /// Returns the number of a layout, with the definitions that have it.
+    fn number(&mut self, digest: Option<[u8; 32]>, text: &Arc<str>) -> u16 {
+        let known = match digest {
+            Some(_) => self.digests.iter().position(|known| *known == digest),
+            None => self.texts.iter().position(|known| known == text),
+        };
+        let number = known.unwrap_or(self.texts.len());
+        if number == LAYOUTS_MAX {
             self.is_full = true;
             return 0;
         }
-        let parse = |text: &str| Definitions::parse(type_name, text).ok();
-        let mut number = self.texts.len();
-        if number > 0 {
-            let texts = &self.texts[self.parsed.len()..];
-            self.parsed.extend(texts.iter().map(|text| parse(text)));
-            let this = parse(text);
-            let is_same = |known: &Option<Definitions>| {
-                known.as_ref().zip(this.as_ref()).is_some_and(|(a, b)| a.is_equivalent(b))
-            };
-            number = self.parsed.iter().position(is_same).unwrap_or(number);
-        }
-        if number == self.texts.len() {
+        if known.is_none() {
+            self.digests.push(digest);
             self.texts.push(text.clone());
         }
-        let number = number as u16; // At most `DEFINITIONS_MAX`.
-        self.known.push((text.clone(), number));
-        number
+        number as u16 // Below `LAYOUTS_MAX`.
     }
+}
+
+/// All definitions of a drive, each parsed once, by their places: the files keep them. Those that
+/// differ only in comments and constants have the digest of one layout.
+#[derive(Default)]
+struct KnownTexts(HashMap<(*const u8, String), KnownText>);
+
+struct KnownText {
+    /// `None` for malformed definitions.
+    digest: Option<[u8; 32]>,
+    /// RIHS01 of the type; `None` for malformed definitions, and for types that have none.
+    hash: Option<String>,
+}
+
+impl KnownTexts {
+    fn get(&mut self, type_name: &str, text: &Arc<str>) -> &KnownText {
+        self.0.entry((text.as_ptr(), short_name(type_name))).or_insert_with(|| {
+            let parsed = Definitions::parse(type_name, text).ok();
+            let digest = parsed.map(|parsed| parsed.layout_digest());
+            KnownText { digest, hash: type_hash(type_name, text).ok() }
+        })
+    }
+}
+
+/// Returns whether a text is a hash of a type. Recorders write others where they know none.
+fn is_rihs01(text: &str) -> bool {
+    let digits = text.strip_prefix("RIHS01_");
+    digits.is_some_and(|it| it.len() == 64 && it.bytes().all(|digit| digit.is_ascii_hexdigit()))
 }
 
 impl DriveTopic {
     fn new(type_name: &str) -> Self {
-        Self {
-            type_name: type_name.to_owned(),
-            layouts: Layouts::default(),
-            messages: Some(0),
-            channels: Vec::new(),
-            foreign: None,
-            foreign_text: None,
-            lacks_text: false,
-            unknown_layout: None,
-            offered_qos: None,
-            found: OnceLock::new(),
-            definitions: OnceLock::new(),
-        }
+        Self { type_name: type_name.to_owned(), messages: Some(0), ..Self::default() }
     }
 
     /// Adds a channel; `messages` is the number of its messages, if it is known.
-    fn add(&mut self, file: usize, id: u16, channel: &ChannelInfo, messages: Option<u64>) {
+    fn add(
+        &mut self,
+        (file, id): (usize, u16),
+        channel: &ChannelInfo,
+        messages: Option<u64>,
+        known: &mut KnownTexts,
+    ) {
         let sum = self.messages.zip(messages);
         self.messages = sum.map(|(known, messages)| known.saturating_add(messages));
-        if channel.message_encoding != "cdr" {
-            self.foreign.get_or_insert_with(|| channel.message_encoding.clone());
-        }
         if self.offered_qos.is_none() {
             self.offered_qos.clone_from(&channel.offered_qos);
         }
-        self.unknown_layout = self.unknown_layout.or(channel.unknown_layout);
         let mut layout = 0;
+        // A channel without messages decides nothing where others have some.
+        if messages != Some(0) || self.messages == Some(0) {
+            layout = self.layout_of(channel, known);
+        }
+        self.channels.push(DriveChannel { file, id, layout });
+    }
+
+    /// Returns the number of the layout of a channel; notes what prevents its messages from being
+    /// read.
+    fn layout_of(&mut self, channel: &ChannelInfo, known: &mut KnownTexts) -> u16 {
+        if channel.message_encoding != "cdr" {
+            self.foreign.get_or_insert_with(|| channel.message_encoding.clone());
+        }
+        self.unknown_layout = self.unknown_layout.or(channel.unknown_layout);
         match &channel.definitions_text {
             Some(text) if channel.schema_encoding == "ros2msg" => {
-                layout = self.layouts.number(&self.type_name, text);
+                let KnownText { digest, hash } = known.get(&self.type_name, text);
+                let stated = channel.type_hash.as_deref().filter(|stated| is_rihs01(stated));
+                let differs =
+                    |hash: &String| stated.is_some_and(|stated| !stated.eq_ignore_ascii_case(hash));
+                if hash.as_ref().is_some_and(differs) {
+                    self.unknown_layout.get_or_insert(OTHER_HASH);
+                }
+                return self.layouts.number(*digest, text);
             }
             // A writer that does not know a type leaves out its text, and the encoding with it.
             None if !channel.type_name.is_empty() => self.lacks_text = true,
@@ -131,7 +168,7 @@ impl DriveTopic {
                 self.foreign_text.get_or_insert_with(|| channel.schema_encoding.clone());
             }
         }
-        self.channels.push(DriveChannel { file, id, layout });
+        0
     }
 
     /// Returns the reason why the layout of some channels is unknown, if there is one.
@@ -141,7 +178,7 @@ impl DriveTopic {
             return self.unknown_layout;
         }
         if layouts.is_full {
-            return Some("it has more than 64 different definitions; replay fewer files at a time");
+            return Some("it has more than 64 layouts; replay fewer files at a time");
         }
         if self.foreign_text.is_some() && !layouts.texts.is_empty() {
             return Some(
@@ -173,19 +210,28 @@ pub(super) struct Catalog {
 
 impl Catalog {
     pub(super) fn build(files: &[(&Path, &Contents)], sources: Option<Sources>) -> Self {
-        let mut by_name: BTreeMap<String, Vec<DriveTopic>> = BTreeMap::new();
+        let mut channels = Vec::new();
         for (file, (_, contents)) in files.iter().enumerate() {
             for (id, channel) in contents.channels.iter() {
-                let topics = by_name.entry(channel.topic.clone()).or_default();
-                let is_same = |topic: &DriveTopic| same_type(&topic.type_name, &channel.type_name);
-                let index = topics.iter().position(is_same).unwrap_or_else(|| {
-                    topics.push(DriveTopic::new(&channel.type_name));
-                    topics.len() - 1
-                });
                 let messages = contents.messages.get(&id).copied().unwrap_or(0);
-                let messages = (!contents.uncounted).then_some(messages);
-                topics[index].add(file, id, channel, messages);
+                channels.push(((file, id), channel, (!contents.uncounted).then_some(messages)));
             }
+        }
+        // Channels without messages come last, where they decide nothing.
+        channels.sort_by_key(|(_, _, messages)| *messages == Some(0));
+        let mut by_name: BTreeMap<String, Vec<DriveTopic>> = BTreeMap::new();
+        let (mut types, mut known) = (HashMap::new(), KnownTexts::default());
+        for (of, channel, messages) in channels {
+            let topics = by_name.entry(channel.topic.clone()).or_default();
+            let index = types.entry((&channel.topic, short_name(&channel.type_name)));
+            let index = *index.or_insert_with(|| {
+                topics.push(DriveTopic::new(&channel.type_name));
+                topics.len() - 1
+            });
+            topics[index].add(of, channel, messages, &mut known);
+        }
+        for topic in by_name.values_mut().flatten() {
+            topic.channels.sort_by_key(|channel| (channel.file, channel.id));
         }
         for topics in by_name.values_mut() {
             topics.sort_by_key(|topic| std::cmp::Reverse(topic.messages.unwrap_or(u64::MAX)));
@@ -266,18 +312,30 @@ impl Catalog {
         Ok(Selected { channels: &topic.channels, messages: topic.messages })
     }
 
+    /// Returns whether the writers of a topic keep samples for readers that come later.
+    pub(super) fn is_latched(&self, spec: &TopicSpec) -> bool {
+        let topic = self.get(&spec.topic, Some(&spec.type_name)).ok();
+        topic.and_then(|topic| latched_depth(topic.offered_qos.as_deref()?)).is_some()
+    }
+
     /// Warns if messages of other types than that of `spec` are left out of its topic.
     pub(super) fn warn_of_other_types(&self, spec: &TopicSpec) {
         let topics = self.by_name.get(&spec.topic).map_or(&[][..], Vec::as_slice);
-        for other in topics.iter().filter(|other| !same_type(&other.type_name, &spec.type_name)) {
-            warn!(
-                topic = %spec.topic,
-                read = %spec.type_name,
-                left_out = %other.type_name,
-                messages = other.messages,
-                "a topic has messages of another type, which are left out"
-            );
+        let others = topics.iter().filter(|other| !same_type(&other.type_name, &spec.type_name));
+        let others: Vec<_> = others.filter(|other| other.messages != Some(0)).collect();
+        if others.is_empty() {
+            return;
         }
+        let names = others.iter().take(NAMED).map(|other| excerpt(&other.type_name));
+        let messages = others.iter().map(|other| other.messages).sum::<Option<u64>>();
+        warn!(
+            topic = %spec.topic,
+            read = %spec.type_name,
+            left_out = %names.collect::<Vec<_>>().join(", "),
+            types = others.len(),
+            messages,
+            "a topic has messages of other types, which are left out"
+        );
     }
 
     /// Returns the definitions of a topic; if it has several types, those of `type_name`, or of the

@@ -264,6 +264,7 @@ fn topics(db: &Connection) -> Result<DatabaseTopics, BoxedError> {
             type_name,
             writer: None,
             is_latched: false,
+            type_hash: Some(hash).filter(|hash| !hash.is_empty()),
             unknown_layout,
         };
         room.make_room(ROW_BYTES + info.bytes())?;

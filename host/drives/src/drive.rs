@@ -1,10 +1,14 @@
 //! Merges all files of a drive into one sequence of messages.
 
+mod latched;
+
 use std::cmp::Reverse;
 use std::collections::binary_heap::PeekMut;
-use std::collections::{BTreeMap, BinaryHeap};
+use std::collections::{BTreeMap, BinaryHeap, VecDeque};
 use std::path::PathBuf;
 use std::sync::Arc;
+
+use latched::EarlierSample;
 
 use super::catalog::Catalog;
 use super::chunk::{OpenSegment, Opener};
@@ -12,6 +16,7 @@ use super::damage::Damage;
 use super::error::ReplayError;
 use super::inflate::Inflate;
 use super::options::{DriveLimits, DriveOptions, Span};
+use super::separate::drives_of;
 use super::step::{Progress, ReplayStep};
 use super::storage;
 use super::track::{Routed, Track, nanoseconds};
@@ -58,7 +63,15 @@ use tracing::warn;
 pub struct Replay {
     tracks: Vec<Track>,
     catalog: Arc<Catalog>,
-    sinks: Vec<Arc<dyn Sink>>,
+    /// The subscriptions, with their sinks.
+    subscribed: Vec<(TopicSpec, Arc<dyn Sink>)>,
+    /// Paths and options of the drive, if latched samples from before the part to replay are
+    /// delivered.
+    opened: Option<(Vec<PathBuf>, DriveOptions)>,
+    /// These samples, which come first.
+    latched: VecDeque<EarlierSample>,
+    /// The damage before the part to replay for which there are none.
+    without_latched: Option<ReplayError>,
     opener: Opener,
     /// Unpacks messages that are packed one by one.
     inflate: Inflate,
@@ -127,22 +140,29 @@ impl Replay {
     ///
     /// # Errors
     ///
-    /// As [`Replay::open`]; [`ReplayError::Overlap`] without [`DriveOptions::merge`].
+    /// As [`Replay::open`]; [`ReplayError::Overlap`] and [`ReplayError::Separate`] without
+    /// [`DriveOptions::merge`].
     pub fn open_as(paths: &[PathBuf], options: &DriveOptions) -> Result<Self, ReplayError> {
         if paths.is_empty() {
             return Err(ReplayError::NoFiles);
         }
         let mut opener = Opener::new(options.limits);
-        let tracks = storage::open(paths, options, &mut opener)?;
+        let (tracks, recordings) = storage::open(paths, options, &mut opener)?;
         if !options.merge {
-            refuse_overlap(&tracks)?;
+            let drives = drives_of(&tracks, &recordings)?;
+            if drives.len() > 1 {
+                return Err(ReplayError::Separate { drives });
+            }
         }
         let files: Vec<_> = tracks.iter().map(Track::path_and_contents).collect();
         let catalog = Arc::new(Catalog::build(&files, options.sources.clone()));
         Ok(Self {
             tracks,
             catalog,
-            sinks: Vec::new(),
+            subscribed: Vec::new(),
+            opened: None,
+            latched: VecDeque::new(),
+            without_latched: None,
             opener,
             inflate: Inflate::new(options.limits.chunk_bytes),
             limits: options.limits,
@@ -180,6 +200,10 @@ impl Replay {
     /// [`ReplayError::Damaged`] or [`ReplayError::Read`], once; see [`Replay`] for what was
     /// delivered before. Every later call returns `None`.
     pub fn step(&mut self) -> Result<Option<ReplayStep>, ReplayError> {
+        self.start()?;
+        if let Some(earlier) = self.latched.pop_front() {
+            return Ok(Some(self.deliver_latched(earlier)));
+        }
         if !self.advance_to_head()? {
             return Ok(None);
         }
@@ -199,7 +223,7 @@ impl Replay {
                 return Err(self.end(error));
             }
         };
-        let sink = &self.sinks[subscription.0];
+        let (_, sink) = &self.subscribed[subscription.0];
         let delivery = if is_malformed {
             if self.delivered == 0 {
                 let why = format!("it begins with {:02x?}", &cdr[..cdr.len().min(4)]);
@@ -234,6 +258,10 @@ impl Replay {
     ///
     /// As [`Replay::step`]: an error reported here is not reported again.
     pub fn peek_at_ns(&mut self) -> Result<Option<i64>, ReplayError> {
+        self.start()?;
+        if !self.latched.is_empty() {
+            return Ok(Some(nanoseconds(self.span.from)));
+        }
         if !self.advance_to_head()? {
             return Ok(None);
         }
@@ -297,9 +325,6 @@ impl Replay {
         if self.delivered > 0 {
             return Ok(true);
         }
-        if !self.started {
-            self.start();
-        }
         while let Some((start, track)) = self.next_open {
             let top = self.heads.peek().map(|Reverse(head)| head.log_time);
             let is_full = top.is_some() && self.open_bytes >= self.limits.open_bytes;
@@ -322,7 +347,7 @@ impl Replay {
             } else {
                 None
             };
-            if let Some(error) = missing {
+            if let Some(error) = missing.or(self.without_latched.take()) {
                 return Err(self.end(error));
             }
             self.ended = true;
@@ -330,8 +355,18 @@ impl Replay {
         Ok(top.is_some())
     }
 
-    fn start(&mut self) {
-        self.started = true;
+    /// Reads what has to be known before the first step, which otherwise does it.
+    ///
+    /// # Errors
+    ///
+    /// As [`Replay::open_as`], if the drive is opened again for latched samples.
+    pub fn start(&mut self) -> Result<(), ReplayError> {
+        if std::mem::replace(&mut self.started, true) {
+            return Ok(());
+        }
+        if let Some((paths, options)) = self.opened.take().filter(|_| self.span.from > 0) {
+            self.read_latched(&paths, &options)?;
+        }
         for track in &mut self.tracks {
             if let Some((before, error)) = track.start(self.span)
                 && !self.span.ends_before(before)
@@ -340,6 +375,7 @@ impl Replay {
             }
         }
         self.find_next_open();
+        Ok(())
     }
 
     fn open_next(&mut self, start: u64, index: usize) -> Result<(), ReplayError> {
@@ -420,7 +456,7 @@ impl Transport for Replay {
             return Err(TransportError::AlreadyStarted { topic: spec.topic.clone() });
         }
         let selected = self.catalog.select(spec)?;
-        let subscription = Subscription(self.sinks.len());
+        let subscription = Subscription(self.subscribed.len());
         for channel in selected.channels {
             self.tracks[channel.file].subscribe(*channel, subscription, spec.max_bytes);
         }
@@ -429,27 +465,13 @@ impl Transport for Replay {
         }
         let expected = self.progress.total.zip(selected.messages);
         self.progress.total = expected.map(|(total, messages)| total.saturating_add(messages));
-        self.sinks.push(sink);
+        self.subscribed.push((spec.clone(), sink));
         Ok(subscription)
     }
 
     fn definitions(&self, topic: &str) -> Result<Arc<Definitions>, TransportError> {
         self.catalog.definitions(topic, self.types.get(topic).map(String::as_str))
     }
-}
-
-/// Refuses files of two recordings with the same topic at the same time: its samples would be
-/// mixed.
-fn refuse_overlap(tracks: &[Track]) -> Result<(), ReplayError> {
-    for (index, track) in tracks.iter().enumerate() {
-        for earlier in &tracks[..index] {
-            if let Some(topic) = earlier.overlap(track) {
-                let [first, second] = [earlier, track].map(|of| of.path_and_contents().0.into());
-                return Err(ReplayError::Overlap { topic: topic.to_owned(), first, second });
-            }
-        }
-    }
-    Ok(())
 }
 
 /// Counts a message that is left out, and names the first one of its topic.

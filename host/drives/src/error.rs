@@ -5,6 +5,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use super::damage::{Damage, DamageLocation};
+use gleaner_base::Exit;
 
 /// Reasons why a drive cannot be opened, or ends early.
 #[derive(Debug, thiserror::Error)]
@@ -160,6 +161,12 @@ pub enum ReplayError {
         /// The other file.
         second: PathBuf,
     },
+    /// The files are several drives.
+    #[error("these are {} separate drives: {}", drives.len(), list(drives))]
+    Separate {
+        /// The files and directories of each drive.
+        drives: Vec<Vec<PathBuf>>,
+    },
     /// The system failed to read the file; the file itself may be intact.
     #[error("cannot read drive `{path}` at byte {offset}")]
     Read {
@@ -215,6 +222,9 @@ impl ReplayError {
                                      by one, or pass --merge if these files are one recording"
                     .to_owned()
             }
+            Self::Separate { .. } => {
+                "take them one by one, or pass --merge if they are one recording".to_owned()
+            }
             Self::Twice { .. } => "its samples would count twice; give each file once".to_owned(),
             Self::Unpack { path, .. } | Self::UnpacksTooLarge { path, .. } => {
                 format!("unpack it yourself: zstd -d {}", word(path))
@@ -263,6 +273,15 @@ impl ReplayError {
             _ => return None,
         })
     }
+
+    /// Returns the exit of a program that ends with this error.
+    pub fn exit(&self) -> Exit {
+        match self {
+            Self::Damaged { .. } => Exit::DriveDamaged,
+            Self::Read { .. } | Self::Unpack { .. } | Self::NoRoom { .. } => Exit::Internal,
+            _ => Exit::Usage,
+        }
+    }
 }
 
 const WHAT_IS_ONE: &str = "a .mcap or .db3 file, or a directory that `ros2 bag record` wrote";
@@ -279,6 +298,16 @@ fn word(path: &Path) -> String {
     format!("'{here}{}'", text.replace('\'', "'\\''"))
 }
 
+/// Most drives that an error names.
+const NAMED: usize = 5;
+
+fn list(drives: &[Vec<PathBuf>]) -> String {
+    let named = drives.iter().flat_map(|drive| drive.first()).take(NAMED);
+    let named: Vec<_> = named.map(|path| format!("`{}`", path.display())).collect();
+    let more = if drives.len() > NAMED { ", ..." } else { "" };
+    named.join(", ") + more
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -293,10 +322,8 @@ mod tests {
             ("-init.db3", "./-init.db3"),
         ] {
             let help = ReplayError::NoTimes { path: path.into() }.help().unwrap();
-            assert!(
-                help.starts_with(&format!("create one: sqlite3 {shown} 'CREATE INDEX")),
-                "{help}"
-            );
+            let expected = format!("create one: sqlite3 {shown} 'CREATE INDEX");
+            assert!(help.starts_with(&expected), "{help}");
         }
     }
 }

@@ -24,6 +24,8 @@ pub(super) struct ChannelInfo {
     pub(super) writer: Option<Guid>,
     /// True for samples from before a clip. Clips state it.
     pub(super) is_latched: bool,
+    /// RIHS01 of its type, as its writer announced it.
+    pub(super) type_hash: Option<String>,
     /// The reason why the layout of its messages is unknown, although definitions were found.
     pub(super) unknown_layout: Option<&'static str>,
 }
@@ -33,7 +35,12 @@ impl ChannelInfo {
     /// Returns the size of its texts, without the definitions, which channels share.
     pub(super) fn bytes(&self) -> usize {
         let texts = [&self.topic, &self.type_name, &self.message_encoding, &self.schema_encoding];
-        texts.into_iter().chain(&self.offered_qos).map(|text| text.len()).sum()
+        texts
+            .into_iter()
+            .chain(&self.offered_qos)
+            .chain(&self.type_hash)
+            .map(|text| text.len())
+            .sum()
     }
 }
 
@@ -123,6 +130,7 @@ impl Channels {
                     ),
                     writer: channel.metadata.get("gleaner.writer").and_then(Guid::from_hex),
                     is_latched: channel.metadata.get("gleaner.latched").is_some(),
+                    type_hash: channel.metadata.get("topic_type_hash").map(str::to_owned),
                     unknown_layout: None,
                 };
                 self.by_id.insert(channel.id, info);

@@ -36,6 +36,7 @@ mod records;
 #[cfg(feature = "bags")]
 mod rows;
 mod scan;
+mod separate;
 mod source;
 mod step;
 mod storage;

@@ -13,8 +13,8 @@ pub struct DriveOptions {
     pub limits: DriveLimits,
     /// Sources of message definitions that the files do not carry; `None` for no search.
     pub sources: Option<Sources>,
-    /// Merge files that have a topic in common and overlap in time: they are one recording. Without
-    /// it, they are refused, unless metadata state that.
+    /// Merge all files by time into one drive, whatever they contain. Without it, files that are
+    /// separate drives are refused, and so are two recordings of one topic at the same time.
     pub merge: bool,
     /// The folder for the content of packed files, which is removed with the replay; `None` for the
     /// system's folder for temporary files.

@@ -64,17 +64,18 @@ fn bag_of(path: &Path) -> Result<Bag, ReplayError> {
     Err(ReplayError::NotBuiltIn { path: path.to_owned(), what: "a rosbag2 directory" })
 }
 
-/// Opens all files of `paths`.
+/// Opens all files of `paths`. Returns them, and the path of each recording: a file, or a directory
+/// whose metadata state that its files are one.
 pub(super) fn open(
     paths: &[PathBuf],
     options: &DriveOptions,
     opener: &mut Opener,
-) -> Result<Vec<Track>, ReplayError> {
+) -> Result<(Vec<Track>, Vec<PathBuf>), ReplayError> {
     let mut writers = Writers::default();
     let mut tracks = Vec::new();
     let mut seen = HashSet::new();
     let mut room = options.limits.unpacked_bytes;
-    let mut recordings = 0;
+    let mut recordings = Vec::new();
     for path in paths {
         let bag = bag_of(path)?;
         if let Some(remark) = &bag.remark {
@@ -94,13 +95,14 @@ pub(super) fn open(
             files.push(open_file(file, options, opener, &mut room)?);
         }
         count(&mut files, &bag.messages);
+        recordings.extend(bag.is_one.then(|| path.clone()));
         for (store, contents) in files {
-            recordings += usize::from(!bag.is_one);
-            tracks.push(Track::new(store, contents, &mut writers, recordings));
+            let file = || store.path().to_owned();
+            recordings.extend((!bag.is_one).then(file));
+            tracks.push(Track::new(store, contents, &mut writers, recordings.len() - 1));
         }
-        recordings += 1;
     }
-    Ok(tracks)
+    Ok((tracks, recordings))
 }
 
 /// Gives files without counts the number of messages of the metadata. With several files, the share

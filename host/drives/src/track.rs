@@ -1,6 +1,5 @@
 //! One file during a replay: the subscriptions of its channels, and its next segment.
 
-use std::collections::HashSet;
 use std::path::Path;
 
 use super::catalog::DriveChannel;
@@ -16,10 +15,7 @@ use super::rows::MessageRows;
 use super::source::SourceFile;
 use super::writers::{ChannelWriter, Writers};
 use gleaner_messages::Endian;
-use gleaner_transport::{SampleMeta, Subscription};
-
-/// Time in ns by which files of one recording may overlap.
-const OVERLAP_MAX: u64 = 1_000_000_000;
+use gleaner_transport::{Guid, SampleMeta, Subscription};
 
 /// Bytes before the CDR of a message.
 const ENCAPSULATION: usize = 4;
@@ -34,7 +30,7 @@ pub(super) enum Store {
 }
 
 impl Store {
-    fn path(&self) -> &Path {
+    pub(super) fn path(&self) -> &Path {
         match self {
             Self::Mcap(source) => source.path(),
             #[cfg(feature = "bags")]
@@ -128,20 +124,18 @@ impl Track {
         }
     }
 
-    /// Returns the topic that both files have, if they are of two recordings that overlap by more
-    /// than a second. A recorder that goes on in another file may write some messages late.
-    pub(super) fn overlap(&self, other: &Self) -> Option<&str> {
-        let ((from, to), (other_from, other_to)) = self.times.zip(other.times)?;
-        let common = to.min(other_to).saturating_sub(from.max(other_from));
-        if self.recording == other.recording || common <= OVERLAP_MAX {
-            return None;
-        }
-        let others: HashSet<&str> = other.topics().collect();
-        self.topics().find(|topic| others.contains(topic))
+    /// Returns whether opening it found damage.
+    pub(super) fn is_damaged(&self) -> bool {
+        self.contents.damage.is_some()
+    }
+
+    /// Returns the number of the recording that it belongs to.
+    pub(super) fn recording(&self) -> usize {
+        self.recording
     }
 
     /// Returns the topics that have messages, or may have some.
-    fn topics(&self) -> impl Iterator<Item = &str> {
+    pub(super) fn topics(&self) -> impl Iterator<Item = &str> {
         let Contents { channels, messages, uncounted, .. } = &self.contents;
         let has_some = |id| *uncounted || messages.get(&id).is_some_and(|count| *count > 0);
         let all = channels.iter().filter(move |(id, _)| has_some(*id));
@@ -161,6 +155,13 @@ impl Track {
     pub(super) fn is_end_unknown(&self) -> bool {
         let is_late = self.times.is_some_and(|(_, last)| i64::try_from(last).is_err());
         self.contents.is_end_unknown || is_late
+    }
+
+    /// Continues the numbers of a writer after `seq`, for the channels of a subscription.
+    pub(super) fn skip_to(&mut self, subscription: Subscription, guid: Guid, seq: u64) {
+        let is_it = |route: &&Route| route.subscriptions.iter().any(|one| one.by == subscription);
+        let writers = self.routes.iter().filter(is_it).filter_map(|route| route.writer.as_ref());
+        writers.filter(|writer| writer.guid() == guid).for_each(|writer| writer.skip_to(seq));
     }
 
     /// Counts a message of `channel` that was left out, and returns its topic.

@@ -49,6 +49,11 @@ impl ChannelWriter {
         self.numbers.last.load(Relaxed)
     }
 
+    /// Continues after the number `seq`.
+    pub(super) fn skip_to(&self, seq: u64) {
+        self.numbers.last.fetch_max(seq, Relaxed);
+    }
+
     /// Counts a message with the recorded number `sequence`.
     pub(super) fn count(&self, sequence: u32) {
         let last = self.last_seq();

@@ -47,6 +47,13 @@ pub enum FeedEvent {
         /// ros2msg text of its type and of all types it refers to; `None` if there is none.
         text: Option<String>,
     },
+    /// The answer to [`Feed::request_layout`].
+    Layout {
+        /// Id of the topic.
+        id: u32,
+        /// Hash (RIHS01) of the layout that is received; `None` if no writer has announced one.
+        type_hash: Option<String>,
+    },
 }
 
 /// A connection to an ingress that may not have started yet.
@@ -146,12 +153,14 @@ impl Feed {
         let awaited = |event: &FeedEvent| match event {
             FeedEvent::Attached(topic) => topic.info.id == id,
             FeedEvent::Refused { id: refused, .. } => *refused == id,
-            FeedEvent::Definitions { .. } => false,
+            FeedEvent::Definitions { .. } | FeedEvent::Layout { .. } => false,
         };
         match self.wait_for(awaited, timeout, || format!("topic {id}"))? {
             FeedEvent::Attached(topic) => Ok(topic),
             FeedEvent::Refused { id, reason } => Err(FeedError::refused(id, reason)),
-            FeedEvent::Definitions { .. } => unreachable!("the event is one of the topic"),
+            FeedEvent::Definitions { .. } | FeedEvent::Layout { .. } => {
+                unreachable!("the event is one of the topic")
+            }
         }
     }
 
@@ -196,6 +205,31 @@ impl Feed {
     /// [`FeedError::Gone`] once the ingress has ended, [`FeedError::Socket`] if it does not read.
     pub fn request_definitions(&mut self, id: u32) -> Result<(), FeedError> {
         Ok(self.requests.need_definitions(id)?)
+    }
+
+    /// Requests the layout that the writers of a topic announce, and waits for it; `None` if there
+    /// is none.
+    ///
+    /// # Errors
+    ///
+    /// [`FeedError::Silent`] after `timeout`; those of [`poll`](Self::poll).
+    pub fn layout(&mut self, id: u32, timeout: Duration) -> Result<Option<String>, FeedError> {
+        self.request_layout(id)?;
+        let awaited = |event: &FeedEvent| matches!(event, FeedEvent::Layout { id: found, .. } if *found == id);
+        match self.wait_for(awaited, timeout, || format!("the layout of topic {id}"))? {
+            FeedEvent::Layout { type_hash, .. } => Ok(type_hash),
+            _ => unreachable!("the event has a layout"),
+        }
+    }
+
+    /// Requests the layout that the writers of a topic announce. The answer is an event. Never
+    /// waits.
+    ///
+    /// # Errors
+    ///
+    /// As [`request_definitions`](Self::request_definitions).
+    pub fn request_layout(&mut self, id: u32) -> Result<(), FeedError> {
+        Ok(self.requests.need_layout(id)?)
     }
 
     /// Returns the newest state of the source, as of the last [`poll`](Self::poll).
@@ -289,6 +323,7 @@ impl Feed {
             }
             (ReaderMessage::Refused { id, reason }, _) => FeedEvent::Refused { id, reason },
             (ReaderMessage::Definitions { id, text }, _) => FeedEvent::Definitions { id, text },
+            (ReaderMessage::Layout { id, type_hash }, _) => FeedEvent::Layout { id, type_hash },
             (ReaderMessage::Status(status), _) => {
                 self.status = *status;
                 return Ok(());

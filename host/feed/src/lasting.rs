@@ -19,6 +19,9 @@ use crate::{FedTopic, Feed, FeedBell, FeedError, FeedEvent};
 /// restart.
 const TIMEOUT: Duration = Duration::from_secs(60);
 
+/// Time in which an ingress that works answers.
+const LAYOUT_TIMEOUT: Duration = Duration::from_secs(1);
+
 /// The connection of this process to the ingress, and after a restart of the ingress to the next
 /// one.
 ///
@@ -97,6 +100,22 @@ impl LastingFeed {
             }
         }
         self.join().map(|()| Vec::new())
+    }
+
+    /// Returns the layout that the writers of a topic announce, as [`Feed::layout`]; `None` also if
+    /// the ingress does not answer within a second.
+    pub fn layout(&mut self, id: u32) -> Option<String> {
+        // The next call of `poll` handles the end of the connection.
+        self.feed.layout(id, LAYOUT_TIMEOUT).ok().flatten().filter(|_| self.gap.is_none())
+    }
+
+    /// As [`Feed::request_layout`].
+    ///
+    /// # Errors
+    ///
+    /// As [`Feed::request_layout`].
+    pub fn request_layout(&mut self, id: u32) -> Result<(), FeedError> {
+        self.feed.request_layout(id)
     }
 
     /// Looks whether samples were lost in the last gap. Call it often while samples arrive: the

@@ -10,7 +10,7 @@ use gleaner_buffers::shared::{
 };
 use gleaner_protocol::ingress::AttachedTopic;
 use gleaner_regions::{ControlRegion, MappedTopic};
-use gleaner_transport::STORED_WORDS;
+use gleaner_transport::{STORED_WORDS, live_definitions};
 
 use crate::FeedError;
 
@@ -28,6 +28,20 @@ pub struct FedTopic {
     /// Finds and holds samples. Their metadata is a [`StoredMeta`](gleaner_transport::StoredMeta),
     /// the counters are [`TopicCounters`](gleaner_transport::TopicCounters).
     pub reader: SharedReader,
+}
+
+impl FedTopic {
+    /// Returns the definitions to use: those of a recording, `local` ones, or those of nodes.
+    pub fn definitions<T>(&self, local: impl FnOnce() -> Option<T>) -> Option<T>
+    where
+        T: AsRef<str> + for<'a> From<&'a str>,
+    {
+        let carried = self.info.definitions.as_deref().map(T::from);
+        if self.info.is_recorded {
+            return carried.or_else(local);
+        }
+        live_definitions(&self.info.type_name, self.info.type_hash.as_deref(), local(), carried)
+    }
 }
 
 impl fmt::Debug for FedTopic {

@@ -275,10 +275,8 @@ fn a_topic_that_does_not_match_its_memory_is_an_error() {
     assert_eq!(refusal(|info| info.layout.slot_bytes = 1 << 20, None), size);
     assert_eq!(refusal(|info| info.layout.depth = 0, None), "topic 2: its sizes are impossible");
     assert_eq!(refusal(|info| info.layout.depth = 16, None), "topic 2: its sizes are impossible");
-    assert_eq!(
-        refusal(|info| info.first = u64::MAX, None),
-        "topic 2: its first position is impossible"
-    );
+    let expected = "topic 2: its first position is impossible";
+    assert_eq!(refusal(|info| info.first = u64::MAX, None), expected);
     assert_eq!(refusal(|info| info.first_word = WORDS - 1, None), words, "one is of topic 1");
     assert_eq!(refusal(|info| info.first_word = HAZARDS as u32 - 1, None), words);
     assert_eq!(refusal(|info| info.first_word = u32::MAX, None), words);
@@ -288,10 +286,8 @@ fn a_topic_that_does_not_match_its_memory_is_an_error() {
     );
     let unsealed = File::from(memfd_create("test", MemfdFlags::ALLOW_SEALING).unwrap());
     unsealed.set_len(LAYOUT.bytes_needed().unwrap() as u64).unwrap();
-    assert_eq!(
-        refusal(|_| {}, Some(unsealed.as_fd())),
-        "topic 2: the memory of the topic is not sealed"
-    );
+    let expected = "topic 2: the memory of the topic is not sealed";
+    assert_eq!(refusal(|_| {}, Some(unsealed.as_fd())), expected);
     let device = File::open("/dev/null").unwrap();
     assert_eq!(refusal(|_| {}, Some(device.as_fd())), size);
 }

@@ -6,6 +6,7 @@
 //! rows of a table.
 
 use std::error::Error;
+use std::fmt::Display;
 use std::io::{BufRead, stdin};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
@@ -16,12 +17,6 @@ use gleaner_inference::backend::{
 };
 use gleaner_inference::inspect::{RTEN_RULES, inspect};
 use serde_json::{Value, json};
-
-/// A model that was refused, or a run that failed.
-enum Stopped {
-    Refused(String),
-    Failed(String),
-}
 
 fn main() -> Result<(), Box<dyn Error>> {
     let library = std::env::args().nth(1);
@@ -42,25 +37,28 @@ fn main() -> Result<(), Box<dyn Error>> {
     for line in stdin().lock().lines() {
         let case: Value = serde_json::from_str(&line?)?;
         let ran = catch_unwind(AssertUnwindSafe(|| run(backend.as_ref(), &case)));
-        let answer = match ran.unwrap_or_else(|_| Err(Stopped::Failed("it panicked".to_owned()))) {
-            Ok(outputs) => json!({ "outputs": outputs }),
-            Err(Stopped::Refused(reason)) => json!({ "refused": reason }),
-            Err(Stopped::Failed(reason)) => json!({ "failed": reason }),
-        };
-        println!("{answer}");
+        let answer = ran.unwrap_or_else(|_| Err(failed("it panicked")));
+        println!("{}", answer.unwrap_or_else(|reason| reason));
     }
     Ok(())
 }
 
-fn run(backend: &dyn Backend, case: &Value) -> Result<Vec<Value>, Stopped> {
-    let refused = |error: &dyn Error| Stopped::Refused(error.to_string());
-    let failed = |error: &dyn Error| Stopped::Failed(error.to_string());
+fn refused(reason: impl Display) -> Value {
+    json!({ "refused": reason.to_string() })
+}
+
+fn failed(reason: impl Display) -> Value {
+    json!({ "failed": reason.to_string() })
+}
+
+/// Returns the answer with the outputs, or the one with the reason why there are none.
+fn run(backend: &dyn Backend, case: &Value) -> Result<Value, Value> {
     let path = case["model"].as_str().unwrap_or_default();
-    let model = std::fs::read(path).map_err(|error| failed(&error))?;
-    let signature = inspect(&model).map_err(|error| refused(&error))?;
+    let model = std::fs::read(path).map_err(failed)?;
+    let signature = inspect(&model).map_err(refused)?;
     let provider = ExecutionProvider::Cpu;
     let options = LoadOptions { provider, threads: 1, signature: &signature, engine: None };
-    let mut graph = backend.load(model, &options).map_err(|error| refused(&error))?;
+    let mut graph = backend.load(model, &options).map_err(refused)?;
     let given = case["inputs"].as_array().map(Vec::as_slice).unwrap_or_default();
     let inputs = signature.inputs.iter().zip(given).map(|(info, given)| {
         let fits = given[0] == info.element.name();
@@ -68,14 +66,15 @@ fn run(backend: &dyn Backend, case: &Value) -> Result<Vec<Value>, Stopped> {
         let shape = serde_json::from_value(given[1].clone()).ok();
         let value = shape.zip(bytes).filter(|_| fits);
         let value = value.map(|(shape, bytes)| TensorValue { element: info.element, shape, bytes });
-        value.ok_or_else(|| Stopped::Failed(format!("no value for input `{}`", info.name)))
+        value.ok_or_else(|| failed(format_args!("no value for input `{}`", info.name)))
     });
     let inputs = inputs.collect::<Result<Vec<_>, _>>()?;
     if inputs.len() != signature.inputs.len() || inputs.len() != given.len() {
-        return Err(Stopped::Failed("another number of inputs".to_owned()));
+        return Err(failed("another number of inputs"));
     }
-    let outputs = graph.run(&inputs, &StopSignal::default()).map_err(|error| failed(&error))?;
-    Ok(outputs.iter().map(|it| json!([it.element.name(), it.shape, hex(&it.bytes)])).collect())
+    let outputs = graph.run(&inputs, &StopSignal::default()).map_err(failed)?;
+    let outputs = outputs.iter().map(|it| json!([it.element.name(), it.shape, hex(&it.bytes)]));
+    Ok(json!({ "outputs": outputs.collect::<Vec<_>>() }))
 }
 
 fn bytes_of(digits: &str) -> Option<Vec<u8>> {

@@ -201,14 +201,11 @@ fn warm(graph: &mut dyn LoadedGraph, inputs: &[TensorInfo], stop: &StopSignal) -
     if planned.iter().map(|(_, _, bytes)| bytes).sum::<u64>() > MAX_TENSOR_BYTES {
         return Warmed::Skipped;
     }
-    let values: Vec<TensorValue> = planned
-        .into_iter()
-        .map(|(element, shape, bytes)| TensorValue {
-            element,
-            shape,
-            bytes: vec![0; bytes as usize],
-        })
-        .collect();
+    let filled = planned.into_iter().map(|(element, shape, length)| {
+        let bytes = vec![0; length as usize];
+        TensorValue { element, shape, bytes }
+    });
+    let values: Vec<TensorValue> = filled.collect();
     match caught(|| graph.run(&values, stop)) {
         Ok(Ok(outputs)) => Warmed::Ran(outputs),
         Ok(Err(error)) => Warmed::Failed(error.to_string()),

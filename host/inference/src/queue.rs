@@ -57,16 +57,6 @@ impl<O: Copy + Eq + Hash, T> FairQueue<O, T> {
         }
         Some((next_entry.owner, next_entry.entry))
     }
-
-    /// Returns the number of entries.
-    pub fn len(&self) -> usize {
-        self.waiting.len()
-    }
-
-    /// Returns whether there is no entry.
-    pub fn is_empty(&self) -> bool {
-        self.waiting.is_empty()
-    }
 }
 
 #[cfg(test)]
@@ -79,7 +69,6 @@ mod tests {
         for (owner, deadline) in [(1, None), (2, Some(30)), (3, Some(10)), (4, Some(30))] {
             queue.push(owner, deadline, ());
         }
-        assert_eq!((queue.len(), queue.is_empty()), (4, false));
         let order: Vec<_> = std::iter::from_fn(|| queue.pop()).map(|(owner, ())| owner).collect();
         assert_eq!(order, [3, 2, 4, 1]);
     }

@@ -163,9 +163,7 @@ impl Ingress {
                 // What it published beyond its rate is lost with it.
                 reader.is_gone |= events.intersects(ended);
             } else if reader.has_more() || events.intersects(ended | PollFlags::IN) {
-                for id in reader.handle_requests(now) {
-                    self.need_definitions(index, id, now);
-                }
+                reader.handle_requests(now).into_iter().for_each(|it| self.answer(index, it, now));
             }
         }
         self.remove_gone();
@@ -311,7 +309,8 @@ impl Ingress {
         let before = self.topics.get(topic).map_or_else(Default::default, |it| it.status.clone());
         reader.topics.push(Attachment { id: grant.id, topic, attached, before, searches: 0 });
         let SharedLayout { depth, slots, slot_bytes } = attached.sizes.layout;
-        let definitions = found.and_then(|found| found.definitions_text.as_deref());
+        let type_hash = self.topics.layout(&*self.source, topic);
+        let current = found.filter(|found| found.type_hash == type_hash);
         let message = AttachedTopic {
             id: grant.id,
             type_name: found.map_or(type_name, |found| &found.type_name).to_owned(),
@@ -321,8 +320,8 @@ impl Ingress {
             first: attached.first,
             digests: attached.digests,
             refused: attached.refused,
-            definitions: definitions.map(str::to_owned),
-            type_hash: found.and_then(|found| found.type_hash.clone()),
+            definitions: current.and_then(|it| Some(it.definitions_text.as_ref()?.to_string())),
+            type_hash,
             is_recorded: self.source.knows_all_topics(),
             offered_qos: found.and_then(|found| found.offered_qos.clone()),
         };
@@ -344,21 +343,24 @@ impl Ingress {
         }
     }
 
-    /// Answers a reader that has no definitions of a topic, at once or when they come.
-    fn need_definitions(&mut self, index: usize, id: u32, now: Instant) {
+    /// Answers a reader that lacks the layout of a topic, or its definitions, once they have come.
+    fn answer(&mut self, index: usize, (id, is_layout): (u32, bool), now: Instant) {
         let reader = &mut self.readers[index];
+        if is_layout {
+            let key = reader.topics.iter().find(|known| known.id == id).map(|known| known.topic);
+            let type_hash = key.and_then(|key| self.topics.layout(&*self.source, key));
+            return reader.send(&ReaderMessage::Layout { id, type_hash }, None);
+        }
         if reader.definitions.iter().any(|wait| wait.id == id) {
             return;
         }
         let topic = reader.topics.iter_mut().find(|known| known.id == id);
-        match topic.filter(|known| known.searches < SEARCHES) {
-            Some(topic) => {
-                topic.searches += 1;
-                reader.definitions.push(DefinitionsWait { id, until: now + DEFINITIONS_TIMEOUT });
-                self.tick_soon();
-            }
-            None => reader.send(&ReaderMessage::Definitions { id, text: None }, None),
-        }
+        let Some(topic) = topic.filter(|known| known.searches < SEARCHES) else {
+            return reader.send(&ReaderMessage::Definitions { id, text: None }, None);
+        };
+        topic.searches += 1;
+        reader.definitions.push(DefinitionsWait { id, until: now + DEFINITIONS_TIMEOUT });
+        self.tick_soon();
     }
 
     /// Looks for what no descriptor announces, if it is time.

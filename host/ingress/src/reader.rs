@@ -155,7 +155,7 @@ impl ConnectedReader {
             }
             ReaderMessage::Refused { reason, .. } => *reason = RefusedTopic::Other(Vec::new()),
             ReaderMessage::Status(status) => status.topics.clear(),
-            ReaderMessage::Welcome => {}
+            ReaderMessage::Welcome | ReaderMessage::Layout { .. } => {}
         }
         if let Err(error) = self.link.send(&message, descriptor) {
             self.disconnect(&error);
@@ -197,9 +197,9 @@ impl ConnectedReader {
         self.has_more
     }
 
-    /// Handles some requests; returns the ids of topics whose definitions are requested. Published
-    /// messages are passed to the source.
-    pub(crate) fn handle_requests(&mut self, now: Instant) -> Vec<u32> {
+    /// Handles some requests; returns the ids of topics whose definitions, or if set, whose layout
+    /// is requested. Published messages are passed to the source.
+    pub(crate) fn handle_requests(&mut self, now: Instant) -> Vec<(u32, bool)> {
         let mut definitions = Vec::new();
         self.has_more = true;
         for _ in 0..TURN {
@@ -214,7 +214,10 @@ impl ConnectedReader {
             }
             match found {
                 Ok(Incoming::Message(ReaderRequest::NeedDefinitions { id })) => {
-                    definitions.push(id);
+                    definitions.push((id, false));
+                }
+                Ok(Incoming::Message(ReaderRequest::NeedLayout { id })) => {
+                    definitions.push((id, true));
                 }
                 Ok(Incoming::Message(ReaderRequest::Publish { index, cdr })) => {
                     self.publish(index, &cdr);

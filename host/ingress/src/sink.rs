@@ -410,21 +410,10 @@ impl Sink for SubscriptionSink {
 
 #[cfg(test)]
 mod tests {
-    use gleaner_messages::Endian;
-
     use super::*;
 
     fn meta(seq: u64) -> SampleMeta {
-        SampleMeta {
-            at_ns: 0,
-            publish_ns: 0,
-            writer: Guid::default(),
-            seq,
-            endian: Endian::Little,
-            options: [0; 2],
-            layout: 0,
-            is_latched: false,
-        }
+        SampleMeta::new(0, Guid::default(), seq)
     }
 
     fn add(topic: &TopicSink, control: &ControlRegion, max_bytes: u64) {

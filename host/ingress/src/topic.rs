@@ -88,6 +88,11 @@ impl SharedTopic {
         }
     }
 
+    /// Returns the hash of the layout of its samples, if a writer has announced one.
+    pub(crate) fn layout(&self, source: &dyn LiveSource) -> Option<String> {
+        source.layout(self.subscription?)
+    }
+
     /// Subscribes the topic, once more if a reader needs more than the subscription was made for.
     ///
     /// # Errors

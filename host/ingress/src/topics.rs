@@ -93,6 +93,11 @@ impl TopicTable {
         self.topics.get(&key)
     }
 
+    /// Returns the hash of the layout of a topic's samples, if a writer has announced one.
+    pub(crate) fn layout(&self, source: &dyn LiveSource, key: u64) -> Option<String> {
+        self.get(key)?.layout(source)
+    }
+
     pub(crate) fn all(&self) -> impl Iterator<Item = &SharedTopic> {
         self.topics.values()
     }

@@ -14,33 +14,18 @@ use gleaner_protocol::ingress::{
     AddReader, HoldGrant, IngressControl, PublishGrant, Qos, TopicGrant,
 };
 use gleaner_transport::{LiveSource, StoredMeta};
-use libtest_mimic::{Arguments, Trial};
+use network_namespace::Test;
 
 const TYPE: &str = "std_msgs/msg/Empty";
 const TIMEOUT: Duration = Duration::from_secs(60);
 
 fn main() -> ExitCode {
-    let arguments = Arguments::from_args();
-    let here = match network_namespace::inside() {
-        true => Ok(()),
-        false => match network_namespace::rerun() {
-            Ok(code) => return code,
-            Err(why) => Err(why),
-        },
-    };
-    let tests: [(&str, fn()); 3] = [
+    let tests: [Test; 3] = [
         ("a_larger_subscription_takes_over_without_a_gap", takes_over),
         ("messages_of_a_reader_reach_other_nodes", publishes),
         ("a_reader_that_returns_gets_no_earlier_sample", returns),
     ];
-    let trials = tests.map(|(name, test)| match &here {
-        Ok(()) => Trial::test(name, move || {
-            test();
-            Ok(())
-        }),
-        Err(why) => Trial::test(format!("{name} [{why}]"), || Ok(())).with_ignored_flag(true),
-    });
-    libtest_mimic::run(&arguments, trials.into()).exit_code()
+    network_namespace::run_tests(tests, |(_, test)| test())
 }
 
 fn open(domain: u16, node: &str) -> Dds {

@@ -17,7 +17,6 @@ use std::time::{Duration, Instant};
 use gleaner_buffers::shared::ControlMemory;
 use gleaner_feed::Feed;
 use gleaner_ingress::Ingress;
-use gleaner_messages::Endian;
 use gleaner_protocol::ingress::{
     AddReader, HoldGrant, IngressControl, IngressLink, PublishGrant, Qos, TopicGrant,
 };
@@ -160,16 +159,7 @@ fn publish(source: &Loopback, stop: &AtomicBool) -> Vec<u64> {
     while !stop.load(Ordering::Relaxed) {
         seq += 1;
         let cdr = seq.to_le_bytes().repeat(1 + seq as usize % WORDS);
-        let meta = SampleMeta {
-            at_ns: seq as i64,
-            publish_ns: seq as i64,
-            writer: Guid(*b"publishes words "),
-            seq,
-            endian: Endian::Little,
-            options: [0; 2],
-            layout: 0,
-            is_latched: false,
-        };
+        let meta = SampleMeta::new(seq as i64, Guid(*b"publishes words "), seq);
         let begun = Instant::now();
         source.publish("/words", &meta, &cdr).unwrap();
         times.push(begun.elapsed().as_nanos() as u64);

@@ -2,6 +2,8 @@
 
 use std::collections::{HashMap, HashSet};
 
+use sha2::{Digest, Sha256};
+
 use super::layout::{Layout, SkipTable};
 use super::parse::{self, Count, Element, FieldDefinition, Primitive};
 
@@ -149,11 +151,19 @@ impl Definitions {
     ///
     /// Comments, constants and default values are no part of them.
     pub fn is_equivalent(&self, other: &Self) -> bool {
-        let all = |definitions: &Self| -> Vec<(String, Vec<FieldDefinition<usize>>)> {
-            definitions.structs.iter().map(|one| (one.name.clone(), one.fields.clone())).collect()
-        };
         // Both list a type before those that contain it, in the order of the fields.
-        all(self) == all(other)
+        let is_same = |(a, b): (&Struct, &Struct)| a.name == b.name && a.fields == b.fields;
+        self.structs.len() == other.structs.len()
+            && self.structs.iter().zip(&other.structs).all(is_same)
+    }
+
+    /// Returns a digest that two definitions share if they define the same fields.
+    pub fn layout_digest(&self) -> [u8; 32] {
+        let mut digest = Sha256::new();
+        for Struct { name, fields, .. } in &self.structs {
+            digest.update(format!("{name} {fields:?}\n"));
+        }
+        digest.finalize().into()
     }
 
     pub(super) fn root(&self) -> &Struct {
@@ -330,6 +340,10 @@ mod tests {
         // Some editors put a byte order mark in front.
         let marked = Definitions::parse("pkg/msg/Outer", &format!("\u{feff}{text}")).unwrap();
         assert!(definitions.is_equivalent(&marked));
+        assert_eq!(definitions.layout_digest(), marked.layout_digest());
+        let swapped = "int8 x\n===\nMSG: other/Far\nint8 y\n";
+        let other = Definitions::parse("pkg/msg/Outer", swapped).unwrap();
+        assert_ne!(definitions.layout_digest(), other.layout_digest());
     }
 
     #[test]
@@ -366,10 +380,8 @@ mod tests {
     #[test]
     fn a_missing_type_is_named() {
         let refused = Definitions::parse("p/T", "q/Gone[] x").unwrap_err();
-        assert_eq!(
-            refused.to_string(),
-            "field `x` of type `p/T` has type `q/Gone`, which is not defined"
-        );
+        let expected = "field `x` of type `p/T` has type `q/Gone`, which is not defined";
+        assert_eq!(refused.to_string(), expected);
     }
 
     #[test]

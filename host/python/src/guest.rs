@@ -179,9 +179,9 @@ impl PythonGuest {
             .extract::<(Bound<'py, PyAny>, Option<Bound<'py, PyString>>, Bound<'py, PyString>)>()?
         {
             // The signal never came: a lambda can ignore it, block it, or disable its timer.
-            (_, None, _) if !allowed.is_zero() && is_late(elapsed, allowed) => Err(
-                CallFault::late("the call returned too late, without the signal", elapsed, allowed),
-            ),
+            (_, None, _) if !allowed.is_zero() && is_late(elapsed, allowed) => {
+                Err(CallFault::late("native code of Python is not interrupted", elapsed, allowed))
+            }
             (result, None, _) => Ok(result),
             (_, Some(message), kind) => {
                 let message = message.to_string_lossy().into_owned();

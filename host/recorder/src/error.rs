@@ -267,10 +267,8 @@ mod tests {
             source: Box::new(RecordError::Write { path: "b".into(), source: full() }),
         };
         for error in [write, format, recover] {
-            assert_eq!(
-                error.help().as_deref(),
-                Some("make room on the disk, or choose another folder: --out DIR")
-            );
+            let expected = Some("make room on the disk, or choose another folder: --out DIR");
+            assert_eq!(error.help().as_deref(), expected);
             assert_eq!(error.exit(), Exit::Internal);
         }
     }

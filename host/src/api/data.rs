@@ -18,10 +18,11 @@ use super::curves::{CurveWriter, Curves};
 pub use super::error::{DataError, DataErrorKind};
 use super::field::FIELD_BYTES;
 pub use super::field::Field;
-use super::frame::Images;
+use super::frame::{ImageMessage, Images};
 use super::fuel::Fuel;
 pub use super::fuel::OutOfFuel;
 use super::inference::TensorLimits;
+use super::live_layout::LiveLayout;
 pub use super::sample::Sample;
 use super::trace::{LookBack, SumsBefore};
 pub use super::values::{Column, Counts, Identity, Stamps, Tick};
@@ -45,6 +46,7 @@ pub struct Topic {
     definitions: Option<Arc<Definitions>>,
     /// By the number of the layout.
     pub(super) headers: Box<[Option<HeaderStamp>]>,
+    pub(crate) live_layout: LiveLayout,
     /// True if its messages have not the layout of the pictures of ROS 2.
     pub(super) has_other_layout: bool,
     pub(super) images: Images,
@@ -96,7 +98,9 @@ impl Topic {
                 .iter()
                 .flat_map(|known| known.layouts().map(header_stamp))
                 .collect(),
-            has_other_layout: definitions.as_deref().is_some_and(|known| !is_viewed(known)),
+            live_layout: LiveLayout::default(),
+            has_other_layout: ImageMessage::is_type(type_name)
+                && definitions.as_deref().is_some_and(|known| !is_viewed(known)),
             reader,
             depth,
             newest: Mutex::default(),
@@ -313,7 +317,7 @@ impl Topic {
         message: &[u8],
         meta: &StoredMeta,
     ) -> Result<f64, DataError> {
-        path.in_layout(meta.sample.layout)
+        path.in_layout(self.live_layout.number_of(&meta.sample))
             .and_then(|path| path.number(message, meta.sample.endian))
             .map_err(|error| self.unreadable(path, error))
     }
@@ -409,9 +413,7 @@ impl Topic {
     /// that arrive while it runs belong to the next wake, as in a replay.
     pub(crate) fn see_until(&self, at_ns: i64, woken_by: Option<u64>) {
         let until = woken_by.map_or_else(|| self.received_until(at_ns), |position| position + 1);
-        self.until.store(until, Ordering::Relaxed);
-        *self.newest.lock().unwrap_or_else(PoisonError::into_inner) =
-            self.reader.newest_before(until);
+        self.hide_from(until);
     }
 
     fn received_until(&self, at_ns: i64) -> u64 {
@@ -421,6 +423,13 @@ impl Topic {
             self.reader.meta(*position).is_none_or(|meta| meta.sample.at_ns > at_ns)
         };
         head - (oldest..head).rev().take_while(is_later).count() as u64
+    }
+
+    /// Hides samples from this position on.
+    pub(crate) fn hide_from(&self, position: u64) {
+        self.until.store(position, Ordering::Relaxed);
+        *self.newest.lock().unwrap_or_else(PoisonError::into_inner) =
+            self.reader.newest_before(position);
     }
 
     /// Receive stamp of the newest sample.

@@ -18,6 +18,7 @@ pub mod frame;
 pub mod fuel;
 mod images;
 pub mod inference;
+pub(crate) mod live_layout;
 pub mod log;
 pub mod models;
 pub mod relayed;

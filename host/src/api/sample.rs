@@ -34,7 +34,7 @@ impl Sample {
     /// Timestamps of the sample.
     pub fn stamps(&self) -> Stamps {
         let meta = self.meta();
-        let header = self.topic.headers.get(usize::from(meta.layout)).and_then(Option::as_ref);
+        let header = self.topic.headers.get(usize::from(self.layout())).and_then(Option::as_ref);
         let header_ns = header.and_then(|header| header.read(&self.lease, meta.endian).ok());
         Stamps { at_ns: meta.at_ns, publish_ns: meta.publish_ns, header_ns }
     }
@@ -51,7 +51,7 @@ impl Sample {
         field.must_belong_to(&self.topic)?;
         let value = field
             .path
-            .in_layout(self.meta().layout)
+            .in_layout(self.layout())
             .and_then(|path| path.read(&self.lease, self.meta().endian))
             .map_err(|error| self.topic.unreadable(&field.path, error))?;
         if let Some(number) = number(&value) {
@@ -128,7 +128,7 @@ impl Sample {
 
     pub(super) fn picture(&self) -> Result<ImageMessage<'_>, DataError> {
         let Topic { topic, type_name, .. } = &*self.topic;
-        if self.topic.has_other_layout && ImageMessage::is_type(type_name) {
+        if self.topic.has_other_layout {
             let type_name = format!("{type_name}, with other fields than in ROS 2");
             return Err(DataError::NoImageType { topic: topic.clone(), type_name });
         }
@@ -147,6 +147,11 @@ impl Sample {
     /// Its position in the ring.
     pub(crate) fn position(&self) -> Option<u64> {
         self.lease.position()
+    }
+
+    /// Number of its layout among those of the definitions.
+    fn layout(&self) -> u16 {
+        self.topic.live_layout.number_of(self.meta())
     }
 
     pub(crate) fn meta(&self) -> &SampleMeta {

@@ -67,7 +67,7 @@ pub trait Guest {
     fn discard(&mut self) {}
 
     /// The engine that runs the lambda, with its version: a decision is only reproducible on the
-    /// same engine.
+    /// same engine. The runtime of each model follows after a semicolon.
     fn engine(&self) -> String;
 
     /// The sandbox layers of the process that runs the lambda. Called before the first `init`.

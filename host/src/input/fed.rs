@@ -6,9 +6,10 @@ use std::time::{Duration, Instant};
 use gleaner_buffers::RingReader;
 use gleaner_feed::{FedTopic, Feed, FeedError};
 use gleaner_lambda::manifest::{InputSpec, Manifest};
+use gleaner_messages::type_description::type_hash;
 use gleaner_messages::{Definitions, Sources, SourcesError};
 use gleaner_protocol::ingress::{RefusedTopic, TopicGrant};
-use gleaner_transport::{StoredMeta, TopicCounters, TransportError, live_definitions};
+use gleaner_transport::{StoredMeta, TopicCounters, TransportError};
 use tracing::warn;
 
 use super::{InputError, Remap, SharedLimits, warn_of_missing_definitions};
@@ -38,16 +39,10 @@ pub fn open_fed_inputs(
     let inputs = manifest.inputs.iter().zip(0..).map(|(input, id)| {
         let on_network = Remap::apply(remaps, input.topic.as_str());
         let attached = feed.topic(id, ATTACH_TIMEOUT);
-        let FedTopic { info, reader } =
-            attached.map_err(|error| refused(input, on_network, error))?;
+        let attached = attached.map_err(|error| refused(input, on_network, error))?;
         let received = |source| InputError::Receive { input: input.name.to_string(), source };
-        let local = || local_definitions(sources, input.type_name.as_str());
-        let carried = info.definitions;
-        let known = if info.is_recorded {
-            carried.or_else(local)
-        } else {
-            live_definitions(&info.type_name, info.type_hash.as_deref(), local(), carried)
-        };
+        let known = attached.definitions(|| local_definitions(sources, input.type_name.as_str()));
+        let FedTopic { info, reader } = attached;
         let text = match known {
             Some(text) => Some(text),
             None => {
@@ -57,6 +52,13 @@ pub fn open_fed_inputs(
                     answer => answer.map_err(received)?,
                 }
             }
+        };
+        // While no writer has announced a layout, samples with one wait for their confirmation.
+        let own = || type_hash(&info.type_name, text.as_deref()?).ok();
+        let layout = match (&info.type_hash, info.is_recorded) {
+            (_, true) => None,
+            (Some(announced), _) => Some((announced.clone(), true)),
+            (None, _) => own().map(|own| (own, false)),
         };
         let definitions = parse(input, on_network, text)?;
         let granted = TopicGrant::for_input(id, input, on_network, false, false).depth;
@@ -73,15 +75,29 @@ pub fn open_fed_inputs(
             sums_digests: Arc::default(),
             sums_before: SumsBefore { digest: info.digests, refused: info.refused },
         };
-        shared.topic(input, ring, definitions)
+        let topic = shared.topic(input, ring, definitions)?;
+        layout.into_iter().for_each(|layout| topic.live_layout.set(layout));
+        topic.hide_unconfirmed();
+        Ok(topic)
     });
     inputs.collect()
 }
 
 /// Continues an input in the memory of an ingress that was started again.
-pub(crate) fn continue_fed_input(topic: &Topic, FedTopic { info, reader }: FedTopic) {
+///
+/// # Errors
+///
+/// [`FeedError::Refused`] if its writers announce another layout now.
+pub(crate) fn continue_fed_input(
+    topic: &Topic,
+    FedTopic { info, reader }: FedTopic,
+) -> Result<(), FeedError> {
+    topic
+        .check_layout(info.type_hash.as_deref())
+        .map_err(|why| FeedError::refused(info.id, RefusedTopic::Other(vec![why])))?;
     let before = SumsBefore { digest: info.digests, refused: info.refused };
     topic.continue_in(reader, info.first, before);
+    Ok(())
 }
 
 /// Returns the error of an input whose topic is not attached.

@@ -1,6 +1,6 @@
 //! Inputs whose rings a source fills in this process, in a replay or a check.
 
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -50,6 +50,8 @@ fn open_input(
     let ingest = Arc::new(Ingest {
         fill: Mutex::new(RingFill { ring: writer, copied: None, sums: ArrivalSums::default() }),
         sums_digests: sums_digests.clone(),
+        slots: (input.slots(), spec.max_bytes),
+        largest: AtomicUsize::default(),
         input: input.name.to_string(),
         topic: spec.topic.clone(),
         refusals: Default::default(),
@@ -87,6 +89,10 @@ const LOG_INTERVAL: Duration = Duration::from_secs(10);
 struct Ingest {
     fill: Mutex<RingFill>,
     sums_digests: Arc<AtomicBool>,
+    /// Number of slots of the ring, and bytes of each.
+    slots: (usize, usize),
+    /// Bytes of the largest sample.
+    largest: AtomicUsize,
     input: String,
     /// Name of the topic after remapping.
     topic: String,
@@ -162,6 +168,7 @@ impl Ingest {
         let mut fill = self.fill();
         // First, so that the slot of a copy that was never accepted is free again.
         fill.copied = None;
+        self.largest.fetch_max(cdr.len(), Ordering::Relaxed);
         let drafted = fill.ring.draft(cdr.len()).map(|mut draft| {
             draft.copy_from_slice(cdr);
             draft
@@ -203,6 +210,21 @@ impl Ingest {
     }
 }
 
+impl Drop for Ingest {
+    /// Warns of a ring of 32 MiB or more if each sample left 15 of 16 bytes of its slot unused.
+    fn drop(&mut self) {
+        let (Self { input, topic, .. }, (slots, max_size)) = (&*self, self.slots);
+        let largest = self.largest.load(Ordering::Relaxed);
+        let ring_mib = slots.saturating_mul(max_size) >> 20;
+        if (1..max_size / 16).contains(&largest) && ring_mib >= 32 {
+            warn!(
+                %input, %topic, largest, max_size, ring_mib,
+                "max_size is large for the samples; `gleaner inspect` prints one that fits"
+            );
+        }
+    }
+}
+
 impl RefusalLog {
     /// Counts a refusal; returns the number to log, if a log line is due.
     fn due(&mut self) -> Option<u64> {
@@ -218,7 +240,6 @@ impl RefusalLog {
 #[cfg(test)]
 mod tests {
     use gleaner_buffers::{HeapRegion, Pool, RingReader};
-    use gleaner_messages::Endian;
     use gleaner_transport::Guid;
 
     use super::*;
@@ -233,6 +254,8 @@ mod tests {
         let ingest = Ingest {
             fill: Mutex::new(fill),
             sums_digests: Arc::default(),
+            slots: (slots, slot_bytes),
+            largest: AtomicUsize::default(),
             input: "camera".to_owned(),
             topic: "/camera".to_owned(),
             refusals: Default::default(),
@@ -241,17 +264,7 @@ mod tests {
     }
 
     fn meta(seq: u64) -> SampleMeta {
-        let (at_ns, writer) = (seq as i64, Guid::default());
-        SampleMeta {
-            at_ns,
-            publish_ns: 0,
-            writer,
-            seq,
-            endian: Endian::Little,
-            options: [0; 2],
-            layout: 0,
-            is_latched: false,
-        }
+        SampleMeta::new(seq as i64, Guid::default(), seq)
     }
 
     #[test]

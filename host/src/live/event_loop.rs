@@ -98,6 +98,10 @@ impl LiveEventLoop {
                 .and_then(|it| it.position());
             topic.see_until(at_ns, woken_by);
         }
+        let woken_by = sample.and_then(|it| Some((it.topic().clone(), it.position()?)));
+        if !self.confirm_layouts(woken_by.as_ref().map(|(topic, at)| (topic, *at)))? {
+            return Ok(());
+        }
         let cause = self.round_trip.is_some().then(|| RoundTrip::cause(&wake, self.clock));
         if let Some(recorder) = &mut self.recorder {
             recorder.begin(&wake);
@@ -122,6 +126,31 @@ impl LiveEventLoop {
         self.results.log(log);
         self.results.decision(decision);
         recorded
+    }
+
+    /// Hides samples of an announced layout, until it is known to be that of the definitions: these
+    /// were chosen before any writer had announced one. Returns false if the sample that causes the
+    /// wake is one of them; it is skipped. Fails if the layout is another one.
+    fn confirm_layouts(&mut self, woken_by: Option<(&Arc<Topic>, u64)>) -> Result<bool, Failure> {
+        let mut is_shown = true;
+        for (topic, id) in self.inputs.iter().zip(0..) {
+            let Some(first) = topic.first_unconfirmed() else { continue };
+            if let Some(announced) = self.feed.layout(id) {
+                topic.live_layout.confirm(&announced).map_err(|why| {
+                    let message = format!("input `{}` cannot be read any more", topic.name());
+                    let mut failure = Failure::new(Exit::Usage, message);
+                    failure.causes.push(format!("topic `{}`: {why}", topic.ros_topic()));
+                    failure.with_help("start it again: it then uses the definition of the writers")
+                })?;
+                continue;
+            }
+            topic.hide_from(first);
+            if woken_by.is_some_and(|(woken, at)| Arc::ptr_eq(woken, topic) && first <= at) {
+                topic.add_skipped(1);
+                is_shown = false;
+            }
+        }
+        Ok(is_shown)
     }
 
     /// Number of messages that were not sent on requested topics.
@@ -188,14 +217,16 @@ impl LiveEventLoop {
                 FeedEvent::Attached(fed) => {
                     let index = usize::try_from(fed.info.id).unwrap_or(usize::MAX);
                     if let Some(topic) = self.inputs.get(index) {
-                        continue_fed_input(topic, fed);
+                        continue_fed_input(topic, fed).map_err(|refused| {
+                            Failure::because("cannot receive an input again", &refused)
+                        })?;
                     }
                 }
                 FeedEvent::Refused { id, reason } => {
                     let refused = FeedError::refused(id, reason);
                     return Err(Failure::because("cannot receive an input again", &refused));
                 }
-                FeedEvent::Definitions { .. } => {}
+                FeedEvent::Definitions { .. } | FeedEvent::Layout { .. } => {}
             }
         }
         self.inputs.iter().for_each(|topic| topic.reader().drop_left());

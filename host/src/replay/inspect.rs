@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use clap::Args;
 use gleaner_base::{Exit, Failure};
-use gleaner_drives::{DriveOptions, Replay, ReplayStep, files_of};
+use gleaner_drives::{DriveOptions, Replay, ReplayError, ReplayStep, files_of};
 use gleaner_messages::{CompressedView, ImageView, Sources};
 use gleaner_protocol::{DriveInfo, DriveTopicInfo, DurationStats, PictureInfo, Report};
 use gleaner_transport::{
@@ -15,7 +15,7 @@ use gleaner_transport::{
 };
 use gleaner_vitals::Durations;
 
-use super::open::DriveError;
+use super::open::{self, DriveError};
 use crate::isolation::definition_dirs;
 
 /// Size in bytes above which only parts of a drive are read; this much takes about a second.
@@ -39,6 +39,9 @@ pub struct InspectArgs {
     /// Read the whole drive, whatever its size.
     #[arg(long)]
     pub all: bool,
+    /// Merge all files by time, even if they are separate drives.
+    #[arg(long)]
+    pub merge: bool,
 }
 
 /// Reads the drives and reports their content.
@@ -47,13 +50,21 @@ pub struct InspectArgs {
 ///
 /// A failure that names the drive that cannot be opened.
 pub fn inspect(args: &InspectArgs, reports: &mut dyn Write) -> Result<Exit, Failure> {
-    let options = DriveOptions {
+    let mut options = DriveOptions {
         sources: Some(Sources::new(&[], &definition_dirs())),
-        merge: true,
+        merge: args.merge,
         ..DriveOptions::default()
     };
+    let mut drive = match Replay::open_as(&args.drives, &options) {
+        Err(ReplayError::Separate { drives }) if open::are_text(&drives) => {
+            super::report(reports, &Report::Separate { drives });
+            return Ok(Exit::Ok);
+        }
+        drive => drive.map_err(DriveError)?,
+    };
+    // A file that grows may become another drive.
+    options.merge = true;
     let open = || Replay::open_as(&args.drives, &options).map_err(DriveError);
-    let mut drive = open()?;
     let (start_ns, end_ns) = (drive.start_ns(), drive.end_ns());
     let (mut topics, skipped) = inspections(drive.topics());
     let mut parts = if args.all || bytes(&args.drives)? <= WHOLE_BYTES {
@@ -302,10 +313,8 @@ mod tests {
         let parts = spread(Some(7), Some(7 + 100 * second));
         assert_eq!(parts.len(), 3);
         assert!(parts[0][0] == 7 && parts[2][1] > 7 + 100 * second, "{parts:?}");
-        assert!(
-            parts.array_windows().all(|[a, b]| a[1] < b[0])
-                && parts.iter().all(|part| part[1] - part[0] == PART_NS)
-        );
+        assert!(parts.array_windows().all(|[a, b]| a[1] < b[0]));
+        assert!(parts.iter().all(|part| part[1] - part[0] == PART_NS));
         assert_eq!(spread(Some(0), Some(5 * second)), Vec::<[i64; 2]>::new());
         assert_eq!(spread(None, None), Vec::<[i64; 2]>::new());
         let to_the_end = spread(Some(7), Some(i64::MAX));

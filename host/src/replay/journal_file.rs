@@ -158,10 +158,8 @@ mod tests {
         std::os::unix::fs::symlink(&target, &link).unwrap();
         let failure = open(&link).unwrap_err();
         let text = failure.to_string();
-        assert!(
-            text.contains("link` exists and is no journal") && text.contains("it is a link"),
-            "{text}"
-        );
+        assert!(text.contains("link` exists and is no journal"), "{text}");
+        assert!(text.contains("it is a link"), "{text}");
         assert_eq!(failure.exit, Exit::Usage);
         assert!(!target.exists());
         fs::hard_link(&journal, &target).unwrap();

@@ -28,9 +28,11 @@ pub use packed::{Packed, UnpackedArgs};
 use std::io::Write;
 
 use gleaner_base::{Exit, Failure};
+use gleaner_drives::ReplayError;
 use gleaner_lambda::manifest::Manifest;
 use gleaner_protocol::Report;
 
+use self::open::DriveError;
 use self::options::{Results, Task};
 use self::output_lock::OutputLock;
 use self::round::ReplayOutcome;
@@ -97,7 +99,17 @@ fn replay(
     let _hold = OutputLock::take(&results.out)?;
     let mut n = 1;
     let ReplayOutcome { summary, broken, incomplete } = loop {
-        let ended = round::replay(options, results, manifest, &mut *load, reports, n == 1)?;
+        let drive = match open::open(options) {
+            // The caller replays them one by one.
+            Err(ReplayError::Separate { drives })
+                if results.journal.is_none() && open::are_text(&drives) =>
+            {
+                report(reports, &Report::Separate { drives });
+                return Ok(Exit::Ok);
+            }
+            drive => drive.map_err(DriveError)?,
+        };
+        let ended = round::replay(drive, options, results, manifest, &mut *load, reports, n == 1)?;
         if results.repeat > 1 {
             report(reports, &Report::Round(round::report(n, &ended.summary)));
         }

@@ -31,25 +31,42 @@ impl Drives {
 /// Opens the drives, merged by time, and returns the range of them that is replayed.
 pub(super) fn open_drives(options: &ReplayOptions) -> Result<(Replay, TimeRange), Failure> {
     let mut drive = open(options).map_err(DriveError)?;
-    let part = options.range.restrict(&mut drive)?;
+    let part = restrict(&mut drive, options)?;
     Ok((drive, part))
 }
 
+/// Restricts a drive to the range to replay, and returns that. It begins with the latched samples
+/// that were valid then.
+pub(super) fn restrict(drive: &mut Replay, options: &ReplayOptions) -> Result<TimeRange, Failure> {
+    let part = options.range.restrict(drive)?;
+    if part.from_ns.is_some() {
+        drive.begin_with_latched(&options.drives.named, &opening(options));
+    }
+    Ok(part)
+}
+
+/// Returns whether a report can hold these paths.
+pub(super) fn are_text(drives: &[Vec<PathBuf>]) -> bool {
+    drives.iter().flatten().all(|path| path.to_str().is_some())
+}
+
 /// Opens the drives, merged by time.
-///
+pub(super) fn open(options: &ReplayOptions) -> Result<Replay, ReplayError> {
+    Replay::open_as(&options.drives.named, &opening(options))
+}
+
 /// Definitions that a drive lacks are searched for as in a live run: beside the lambda, among the
 /// bundled ones, and where ROS 2 is installed.
-pub(super) fn open(options: &ReplayOptions) -> Result<Replay, ReplayError> {
+fn opening(options: &ReplayOptions) -> replay::DriveOptions {
     let sources = Sources::new(&[options.lambda.build.path().join("msg")], &definition_dirs());
     let (unpack_in, unpacked) = (options.unpack_in.clone(), options.unpacked.clone());
-    let opening = replay::DriveOptions {
+    replay::DriveOptions {
         sources: Some(sources),
         merge: options.merge,
         unpack_in,
         unpacked,
         ..replay::DriveOptions::default()
-    };
-    Replay::open_as(&options.drives.named, &opening)
+    }
 }
 
 /// An error of a drive, for users.
@@ -69,12 +86,6 @@ impl Explain for DriveError {
     }
 
     fn exit(&self) -> Exit {
-        match self.0 {
-            ReplayError::Damaged { .. } => Exit::DriveDamaged,
-            ReplayError::Read { .. } | ReplayError::Unpack { .. } | ReplayError::NoRoom { .. } => {
-                Exit::Internal
-            }
-            _ => Exit::Usage,
-        }
+        self.0.exit()
     }
 }

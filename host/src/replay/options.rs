@@ -22,10 +22,11 @@ pub struct ReplayArgs {
     #[command(flatten)]
     #[allow(missing_docs)]
     pub lambda_args: LambdaArgs,
-    /// MCAP files, databases and directories of rosbag2; several are merged by time.
+    /// MCAP files, databases and directories of rosbag2. Separate drives are reported, and not
+    /// replayed.
     #[arg(required = true)]
     pub drives: Vec<PathBuf>,
-    /// Merge drives that have a topic in common and overlap in time: they are one recording.
+    /// Merge all files by time, even if they are separate drives.
     #[arg(long)]
     pub merge: bool,
     /// Replay from this time on: seconds after the drive's start, or since 1970 after an `@`.

@@ -195,7 +195,6 @@ fn remove(folder: &Path) -> Result<(), OutputError> {
 
 #[cfg(test)]
 mod tests {
-    use gleaner_messages::Endian;
     use gleaner_transport::Guid;
 
     use super::*;
@@ -222,17 +221,7 @@ mod tests {
     }
 
     fn meta(at_ns: i64) -> SampleMeta {
-        let (writer, endian) = (Guid::default(), Endian::Little);
-        SampleMeta {
-            at_ns,
-            publish_ns: 0,
-            writer,
-            seq: at_ns as u64,
-            endian,
-            options: [0; 2],
-            layout: 0,
-            is_latched: false,
-        }
+        SampleMeta::new(at_ns, Guid::default(), at_ns as u64)
     }
 
     #[test]
@@ -252,11 +241,8 @@ mod tests {
             pictures.wake(&triggered(10 * n + 1));
         }
         let (written, omitted) = pictures.write(out.path()).unwrap();
-        assert!(
-            written.len() <= Signals::PICTURES_MAX && written.len() > Signals::PICTURES_MAX / 3,
-            "{}",
-            written.len()
-        );
+        let (count, most) = (written.len(), Signals::PICTURES_MAX);
+        assert!(count <= most && count > most / 3, "{count}");
         assert_eq!(written.len() as u64 + omitted, 1000);
         assert!(written.last().unwrap().at_ns > 9000, "the end of the drive has pictures");
         for TriggerPicture { at_ns, topic, image_ns, file } in written {

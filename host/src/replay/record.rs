@@ -4,7 +4,7 @@
 use std::path::Path;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use gleaner_base::{Exit, Failure};
+use gleaner_base::{Exit, Failure, excerpt};
 use gleaner_drives::Replay;
 use gleaner_journal::{JournalEntry, JournalHeader};
 use gleaner_lambda::Clip;
@@ -13,11 +13,18 @@ use gleaner_recorder::{
     EarlierClips, LambdaId, LambdaSpec, RecordError, Recorder, RecordingFolder, Settings, TopicId,
     TopicSchema, is_image, lambda_digest,
 };
-use gleaner_transport::{Delivery, DiscoveredTopic, SampleMeta, Sink, Transport};
+use gleaner_transport::{Delivery, DiscoveredTopic, SampleMeta, Sink, Transport, same_type};
 
 use super::pictures::RecordedCamera;
 use super::topic_filter;
 use super::{CLOCK, ReplayOptions};
+use crate::input::Remap;
+
+/// Most sentences on what all clips lack.
+const NOTES_MAX: usize = 64;
+
+/// Most types of a topic that a clip names as left out.
+const NOTED: usize = 8;
 
 /// A recorder over one lambda's `[record]`.
 pub(super) struct ReplayRecorder {
@@ -25,6 +32,8 @@ pub(super) struct ReplayRecorder {
     /// The recorded topics.
     topics: Vec<Arc<TopicRecorder>>,
     rules: RecordSpec,
+    /// Sentences on what all clips lack.
+    notes: Vec<String>,
     /// Clips of an earlier replay, and those of them that were recovered now; until they are
     /// replaced.
     earlier: Option<(EarlierClips, Vec<Clip>)>,
@@ -108,12 +117,24 @@ impl ReplayRecorder {
         let shared = Arc::new(Mutex::new(SharedRecorder { recorder: None, failed: None }));
         let known = drive.topics();
         let mut topics = Vec::new();
+        let chosen = topic_filter::topics(rules, options, drive, &known)?;
+        let mut notes = Vec::from_iter(chosen.left_out);
         // No camera is kept if the lambda itself has an input with images.
         let mut is_seen = manifest.inputs.iter().any(|input| is_image(input.type_name.as_str()));
-        for name in topic_filter::topics(rules, options, drive, &known)? {
+        for name in &chosen.names {
             let name = name.as_str();
-            // The first of several types has the most messages.
-            let found = known.iter().find(|topic| topic.topic == name);
+            let found = recorded_type(name, &known, manifest, options);
+            let others = known.iter().filter(|topic| topic.topic == name);
+            let is_other = |topic: &&DiscoveredTopic| {
+                found.is_some_and(|found| found.type_name != topic.type_name)
+            };
+            let others = others.filter(is_other);
+            notes.extend(others.filter(|topic| topic.messages != Some(0)).take(NOTED).map(
+                |topic| {
+                    let (name, type_name) = (excerpt(name), excerpt(&topic.type_name));
+                    format!("no messages of {name} that have the type {type_name}")
+                },
+            ));
             if found.is_none() {
                 tracing::warn!(
                     topic = %name,
@@ -160,7 +181,8 @@ impl ReplayRecorder {
             };
             return Err(failure.with_help(help));
         }
-        Ok(Some(Self { shared, topics, rules: rules.clone(), earlier: None, lambda: None }))
+        let rules = rules.clone();
+        Ok(Some(Self { shared, topics, rules, notes, earlier: None, lambda: None }))
     }
 
     /// The camera of a recorded topic, if the lambda has no input with images.
@@ -187,6 +209,7 @@ impl ReplayRecorder {
             prefault: false,
         };
         let mut recorder = Recorder::new(folder, settings)?;
+        self.notes.drain(..).take(NOTES_MAX).for_each(|note| recorder.note(note));
         let mut topics = Vec::new();
         for recorded in &self.topics {
             let id = if recorded.exists {
@@ -250,12 +273,32 @@ impl ReplayRecorder {
     }
 }
 
+/// Chooses the type in which a topic of the drive is recorded: that in which the lambda reads it,
+/// else the one with the most messages.
+fn recorded_type<'t>(
+    name: &str,
+    known: &'t [DiscoveredTopic],
+    manifest: &Manifest,
+    options: &ReplayOptions,
+) -> Option<&'t DiscoveredTopic> {
+    let is_read = |topic: &&DiscoveredTopic| {
+        manifest.inputs.iter().any(|input| {
+            Remap::apply(&options.lambda.remaps, input.topic.as_str()) == name
+                && same_type(input.type_name.as_str(), &topic.type_name)
+        })
+    };
+    let mut types = known.iter().filter(|topic| topic.topic == name);
+    let first = types.next()?;
+    Some(std::iter::once(first).chain(types).find(is_read).unwrap_or(first))
+}
+
 fn topic(name: &str, found: Option<&DiscoveredTopic>) -> TopicSchema {
+    let found = found.cloned().unwrap_or_default();
     TopicSchema {
         name: name.to_owned(),
-        type_name: found.map(|topic| topic.type_name.clone()).unwrap_or_default(),
-        definitions: found.and_then(|topic| topic.definitions_text.clone()),
-        other_definitions: found.map(|topic| topic.other_definitions.clone()).unwrap_or_default(),
-        offered_qos: found.and_then(|topic| topic.offered_qos.clone()),
+        type_name: found.type_name,
+        definitions: found.definitions_text,
+        other_definitions: found.other_definitions,
+        offered_qos: found.offered_qos,
     }
 }

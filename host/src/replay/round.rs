@@ -16,7 +16,7 @@ use gleaner_vitals::usage;
 use super::digests::Digests;
 use super::drive_loop::{self, DriveHandler, DriveSpan, LoopEnd};
 use super::journal_file::JournalFile;
-use super::open::{DriveError, open_drives};
+use super::open::{self, DriveError};
 use super::options::Results;
 use super::record::{ReplayRecorder, remove_clips};
 use super::signals::SignalCollector;
@@ -182,7 +182,7 @@ impl ReplayLoop<'_> {
         manifest: &Manifest,
         end: ReplayEnd<'_>,
     ) -> ReplaySummary {
-        let ReplayEnd { drive, at_ns, broken, recorded, totals, wall_s } = end;
+        let ReplayEnd { drive, at_ns, broken, recorded, totals, models, wall_s } = end;
         let start_ns = drive.start_ns().unwrap_or(0);
         ReplaySummary {
             lambda: manifest.lambda.name.to_string(),
@@ -214,6 +214,7 @@ impl ReplayLoop<'_> {
             peak_rss_bytes: self.invoker.peak_resident_bytes(),
             topics: self.session.inputs().iter().zip(&totals.counts).map(topic_report).collect(),
             recording: recorded,
+            models,
             clips_replaced: self.clips_replaced,
             damaged: broken.map(|error| {
                 let mut failure = Failure::because("the drive could not be read to its end", error);
@@ -233,6 +234,8 @@ struct ReplayEnd<'a> {
     broken: Option<&'a DriveError>,
     recorded: RecordingCounts,
     totals: &'a Totals,
+    /// The runtime of each model.
+    models: Vec<String>,
     wall_s: f64,
 }
 
@@ -246,6 +249,7 @@ pub(super) struct ReplayOutcome {
 }
 
 pub(super) fn replay(
+    mut drive: Replay,
     options: &ReplayOptions,
     results: &Results,
     manifest: &Manifest,
@@ -254,7 +258,7 @@ pub(super) fn replay(
     is_first: bool,
 ) -> Result<ReplayOutcome, Failure> {
     let name = manifest.lambda.name.as_str();
-    let (mut drive, part) = open_drives(options)?;
+    let part = open::restrict(&mut drive, options)?;
     let mut recording = if results.record {
         ReplayRecorder::subscribe(manifest, options, &mut drive)?
     } else {
@@ -262,14 +266,17 @@ pub(super) fn replay(
     };
     let SessionSetup { inputs, session, mut guest } =
         SessionSetup::load(&mut drive, &options.lambda, manifest, RunMode::Replay, load)?;
+    let engine = guest.engine();
+    let models = models_of(&engine);
     let has_header = results.journal.is_some() || recording.is_some();
-    let header = has_header
-        .then(|| journal_header(&options.lambda, manifest, guest.engine(), part))
-        .transpose()?;
+    let header =
+        has_header.then(|| journal_header(&options.lambda, manifest, engine, part)).transpose()?;
     // Its preroll is allocated before `init`, from which on memory counts as the lambda's.
     if let (Some(recording), Some(header)) = (&mut recording, &header) {
         recording.start(&results.out, header)?;
     }
+    // Before `init`, too.
+    drive.start().map_err(DriveError)?;
     let digests = results.journal.as_ref().map(|_| Digests::start(options.drives.files.clone()));
     let signals = SignalCollector::of(&inputs, recording.as_ref().and_then(ReplayRecorder::camera));
     let layers = guest.layers()?;
@@ -326,6 +333,7 @@ pub(super) fn replay(
         broken: broken.as_ref(),
         recorded,
         totals: &totals,
+        models,
         wall_s: started.elapsed().as_secs_f64(),
     };
     let summary = replay_loop.summary(options, &results.out, manifest, end);
@@ -336,6 +344,11 @@ pub(super) fn replay(
         .err();
     output.finish(&summary)?;
     Ok(ReplayOutcome { summary, broken: broken.map(|error| error.exit()), incomplete })
+}
+
+/// Returns the part of an engine's name for each model.
+fn models_of(engine: &str) -> Vec<String> {
+    engine.split("; ").filter(|part| part.starts_with("model ")).map(str::to_owned).collect()
 }
 
 /// Describes the lambda, for the journal and for clips.

@@ -3,7 +3,7 @@
 
 use std::collections::HashSet;
 
-use gleaner_base::{Exit, Failure};
+use gleaner_base::{Exit, Failure, excerpt};
 use gleaner_drives::Replay;
 use gleaner_lambda::manifest::RecordSpec;
 use gleaner_recorder::{MESSAGE_MAX, TOPICS_MAX};
@@ -15,14 +15,23 @@ use crate::input::Remap;
 /// Maximum number of topics that a message names.
 const NAMED: usize = 20;
 
-/// Names of the topics that clips are to hold, as in the drive, each once.
+/// Topics that clips are to hold.
+#[derive(Default)]
+pub(super) struct ChosenTopics {
+    /// Their names, as in the drive, each once.
+    pub(super) names: Vec<String>,
+    /// A sentence on those that were to be recorded too, but cannot be read.
+    pub(super) left_out: Option<String>,
+}
+
+/// Chooses the topics that clips are to hold.
 pub(super) fn topics(
     rules: &RecordSpec,
     options: &ReplayOptions,
     drive: &Replay,
     known: &[DiscoveredTopic],
-) -> Result<Vec<String>, Failure> {
-    let (mut chosen, mut names) = (HashSet::new(), Vec::new());
+) -> Result<ChosenTopics, Failure> {
+    let (mut chosen, mut names, mut left_out) = (HashSet::new(), Vec::new(), Vec::new());
     // Two topics of the manifest may be one of the drive, and two patterns may match one.
     let mut add = |name: &str| {
         if chosen.insert(name.to_owned()) {
@@ -34,7 +43,7 @@ pub(super) fn topics(
             .topics
             .iter()
             .for_each(|topic| add(Remap::apply(&options.lambda.remaps, topic.as_str())));
-        return Ok(names);
+        return Ok(ChosenTopics { names, left_out: None });
     }
     for pattern in &options.topics {
         let found: Vec<_> = known.iter().filter(|topic| matches(pattern, &topic.topic)).collect();
@@ -64,14 +73,18 @@ pub(super) fn topics(
             );
         }
         readable.iter().for_each(|topic| add(&topic.topic));
+        left_out.extend(others);
     }
+    left_out.retain(|topic| !names.contains(&topic.topic));
     if names.len() > TOPICS_MAX {
         let message =
             format!("--topics chooses {} topics; clips hold at most {TOPICS_MAX}", names.len());
         return Err(Failure::new(Exit::Usage, message)
             .with_help("choose fewer: --topics PATTERN, as in '/camera/*'"));
     }
-    Ok(names)
+    let sentence = || format!("no messages of {}, which cannot be read", list(left_out.clone()));
+    let left_out = (!left_out.is_empty()).then(sentence);
+    Ok(ChosenTopics { names, left_out })
 }
 
 /// The subscription that records a topic of the drive.
@@ -97,7 +110,7 @@ fn nothing_readable(
 pub(super) fn list<'a>(topics: impl IntoIterator<Item = &'a DiscoveredTopic>) -> String {
     let mut topics = topics.into_iter();
     let names: Vec<_> =
-        topics.by_ref().take(NAMED).map(|topic| format!("`{}`", topic.topic)).collect();
+        topics.by_ref().take(NAMED).map(|topic| format!("`{}`", excerpt(&topic.topic))).collect();
     match (names.is_empty(), topics.count()) {
         (true, _) => "no topic".to_owned(),
         (false, 0) => names.join(", "),

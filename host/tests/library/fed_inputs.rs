@@ -9,10 +9,12 @@ use gleaner_host::api::data::Topic;
 use gleaner_host::input::open_fed_inputs;
 use gleaner_ingress::Ingress;
 use gleaner_lambda::manifest::Manifest;
-use gleaner_messages::{Endian, Sources};
+use gleaner_messages::Sources;
 use gleaner_protocol::ingress::{AddReader, IngressControl, TopicGrant};
 use gleaner_transport::loopback::Loopback;
 use gleaner_transport::{Guid, SampleMeta};
+
+use crate::meta;
 
 const TYPE: &str = "test_msgs/msg/Number";
 
@@ -54,22 +56,11 @@ impl FedInputs {
 
     /// Publishes a sample of input `number`.
     fn publish(&self, number: u32, value: i64) {
-        let (writer, endian, seq) = (Guid([7; 16]), Endian::Little, value as u64);
-        let meta = SampleMeta {
-            at_ns: value,
-            publish_ns: value,
-            writer,
-            seq,
-            endian,
-            options: [0; 2],
-            layout: 0,
-            is_latched: false,
-        };
+        let meta = SampleMeta { writer: Guid([7; 16]), ..meta(value, value as u64) };
         let cdr = value.to_le_bytes();
         self.loopback.publish(&topic(number), &meta, &cdr).unwrap();
     }
 
-    /// Ends the ingress.
     fn end(self) {
         drop((self.feed, self.control));
         self.ingress.join().unwrap();

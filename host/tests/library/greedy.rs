@@ -13,12 +13,12 @@ use gleaner_host::guest::{Guest, WakeOutcome};
 use gleaner_host::input::open_inputs;
 use gleaner_lambda::Fault;
 use gleaner_lambda::manifest::{ConfigValue, Limits, Manifest};
-use gleaner_messages::Endian;
 use gleaner_transport::loopback::Loopback;
-use gleaner_transport::{Guid, SampleMeta};
 
 use gleaner_tests::drive::{IMAGE, image};
 use gleaner_tests::{TempFolder, root};
+
+use crate::meta;
 
 /// Fuel of a wake.
 pub const FUEL: u64 = 5_000_000;
@@ -191,18 +191,7 @@ pub fn subscribed(manifest: &Manifest, definition: &str) -> (Loopback, Arc<Topic
 ///
 /// If there is no such topic.
 pub fn publish(transport: &mut Loopback, topic: &str, seq: u64, cdr: &[u8]) {
-    let (at_ns, writer, endian, options) = (seq as i64, Guid::default(), Endian::Little, [0; 2]);
-    let meta = SampleMeta {
-        at_ns,
-        publish_ns: at_ns,
-        writer,
-        seq,
-        endian,
-        options,
-        layout: 0,
-        is_latched: false,
-    };
-    transport.publish(topic, &meta, cdr).expect("a topic");
+    transport.publish(topic, &meta(seq as i64, seq), cdr).expect("a topic");
 }
 
 /// A hand-written component of this world. `parts` precede the module `lambda`, which has `body`

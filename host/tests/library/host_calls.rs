@@ -19,10 +19,11 @@ use gleaner_messages::Endian;
 use gleaner_operations::{DriverStep, MESSAGE, Operation, setup};
 use gleaner_tests::drive::{COMPRESSED, CdrBuilder, IMAGE, compressed, image};
 use gleaner_tests::{root, times};
+use gleaner_transport::SampleMeta;
 use gleaner_transport::loopback::Loopback;
-use gleaner_transport::{Guid, SampleMeta};
 use gleaner_vitals::usage;
 
+use crate::meta;
 use crate::own_process::ran_elsewhere;
 
 /// Maximum growth of the process over all programs, in bytes. The limits of `driver` bound its
@@ -77,7 +78,6 @@ impl RandomNumbers {
 /// The part of a wake's outcome that must be reproducible.
 type ComparedOutcome = (Result<(), Fault>, Option<u64>, Vec<Trigger>);
 
-/// The lambda `driver` and its inputs.
 struct DriverGuest {
     guest: WasmGuest,
     session: Session,
@@ -116,16 +116,7 @@ impl DriverGuest {
         self.sent += 1;
         let (at_ns, seq) = (self.sent as i64 * 1_000_000, self.sent);
         let endian = if cdr.len() % 7 == 5 { Endian::Big } else { Endian::Little };
-        let meta = SampleMeta {
-            at_ns,
-            publish_ns: at_ns,
-            writer: Guid::default(),
-            seq,
-            endian,
-            options: [0; 2],
-            layout: 0,
-            is_latched: false,
-        };
+        let meta = SampleMeta { endian, ..meta(at_ns, seq) };
         self.transport.publish(topic, &meta, cdr).unwrap();
     }
 

@@ -22,7 +22,7 @@ use gleaner_host::session_setup::ConfiguredLambda;
 use gleaner_ingress::Ingress;
 use gleaner_lambda::manifest::Manifest;
 use gleaner_lambda::{BuildDir, Fault, FaultKind};
-use gleaner_messages::{Definitions, Endian};
+use gleaner_messages::Definitions;
 use gleaner_protocol::ingress::{
     AddReader, IngressControl, PublishGrant, ReceptionStatus, TopicGrant,
 };
@@ -89,8 +89,11 @@ impl Guest for NumbersGuest {
     }
 }
 
+/// The hash that writers of [`NUMBERS`] have announced.
+pub type Announced = Arc<Mutex<Option<String>>>;
+
 /// A loopback with a writer of each topic, which loses nothing itself.
-struct WrittenLoopback(Loopback);
+struct WrittenLoopback(Loopback, Announced);
 
 impl Transport for WrittenLoopback {
     fn topics(&self) -> Vec<DiscoveredTopic> {
@@ -123,6 +126,10 @@ impl LiveSource for WrittenLoopback {
         self.0.health()
     }
 
+    fn layout(&self, _: Subscription) -> Option<String> {
+        self.1.lock().unwrap().clone()
+    }
+
     fn publisher(
         &self,
         topic: &str,
@@ -140,9 +147,9 @@ fn add_topics(loopback: &Loopback) {
 
 /// A run in a thread of its own.
 pub struct Running {
-    /// Folder of the lambda.
     _folder: TempFolder,
     loopback: Loopback,
+    pub announced: Announced,
     added: AddReader,
     /// The starter's end of the socket over which it passes connections.
     handover: UnixStream,
@@ -158,7 +165,7 @@ pub struct Running {
 
 impl Running {
     /// Starts a run and waits until it is ready.
-    fn start(announce: Option<&str>) -> Self {
+    pub fn start(announce: Option<&str>) -> Self {
         let mut running = Self::begin(announce, None);
         running.until_ready();
         running
@@ -182,7 +189,8 @@ impl Running {
         add_topics(&loopback);
         let (reports, to_reports) = pipe().unwrap();
         let (results, to_results) = pipe().unwrap();
-        let source = Box::new(WrittenLoopback(loopback.clone()));
+        let announced = Announced::default();
+        let source = Box::new(WrittenLoopback(loopback.clone(), announced.clone()));
         let (mut control, ingress) = Ingress::start_in_thread(source);
         let input = &manifest.inputs[0];
         let added = AddReader {
@@ -232,6 +240,7 @@ impl Running {
         Self {
             _folder: lambda,
             loopback,
+            announced,
             added,
             handover,
             ingress,
@@ -255,8 +264,7 @@ impl Running {
         Handover { recorder, ..Handover::default() }.try_send(&self.handover).unwrap();
     }
 
-    /// Ends the ingress.
-    fn end_ingress(&mut self) {
+    pub fn end_ingress(&mut self) {
         let (control, ingress) = self.ingress.take().unwrap();
         drop(control);
         ingress.join().unwrap();
@@ -265,7 +273,7 @@ impl Running {
     }
 
     /// Waits for the status of a run with so many ends of the ingress.
-    fn interrupted(&mut self, count: u64) -> LiveStatus {
+    pub fn interrupted(&mut self, count: u64) -> LiveStatus {
         self.live(|live| live.reception_gaps.count == count)
     }
 
@@ -277,32 +285,28 @@ impl Running {
     }
 
     /// Starts an ingress again; returns the run's connection to it.
-    fn start_ingress(&mut self) -> OwnedFd {
-        let source = Box::new(WrittenLoopback(self.loopback.clone()));
+    pub fn start_ingress(&mut self) -> OwnedFd {
+        let source = Box::new(WrittenLoopback(self.loopback.clone(), self.announced.clone()));
         let (mut control, ingress) = Ingress::start_in_thread(source);
         let socket = control.add_reader(&self.added).unwrap();
         self.ingress = Some((control, ingress));
         socket
     }
 
-    fn hand_over(&self, socket: OwnedFd) {
+    pub fn hand_over(&self, socket: OwnedFd) {
         let ingress = Some(socket);
         Handover { ingress, ..Handover::default() }.try_send(&self.handover).unwrap();
     }
 
     pub fn publish(&mut self, value: i64) {
+        self.publish_in(0, value);
+    }
+
+    /// Publishes a number by a writer that announces a hash, if `layout` is 1.
+    pub fn publish_in(&mut self, layout: u16, value: i64) {
         self.sent += 1;
         let (at_ns, seq) = (self.clock.now(), self.sent);
-        let meta = SampleMeta {
-            at_ns,
-            publish_ns: at_ns,
-            writer: Guid([7; 16]),
-            seq,
-            endian: Endian::Little,
-            options: [0; 2],
-            layout: 0,
-            is_latched: false,
-        };
+        let meta = SampleMeta { writer: Guid([7; 16]), layout, ..crate::meta(at_ns, seq) };
         self.loopback.publish(NUMBERS, &meta, &value.to_le_bytes()).unwrap();
     }
 
@@ -457,7 +461,6 @@ fn a_lambda_that_keeps_too_many_samples_faults_and_goes_on() {
     assert_eq!(ended.unwrap(), Exit::LambdaFaulted);
 }
 
-/// Forwards the messages of a topic.
 struct ForwardingSink(Mutex<SyncSender<Vec<u8>>>);
 
 impl Sink for ForwardingSink {

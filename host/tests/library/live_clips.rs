@@ -3,16 +3,27 @@
 
 use gleaner_base::Exit;
 use gleaner_lambda::Clip;
+use gleaner_protocol::Verified;
 
 use crate::recorded_run::{RecordedRun, SLOW, TRIGGER};
 
-#[test]
-fn a_live_clip_is_verified_with_all_of_its_wakes() {
+/// Starts a run whose recorder has all topics, with `n` wakes and a trigger.
+fn recorded(n: i64) -> RecordedRun {
     let mut running = RecordedRun::start();
     running.record_others();
-    running.burst(50);
+    running.burst(n);
+    running
+}
+
+fn verified(running: &mut RecordedRun) -> Verified {
     let clip = running.clip();
-    let verified = running.verify(clip).unwrap();
+    running.verify(clip).unwrap()
+}
+
+#[test]
+fn a_live_clip_is_verified_with_all_of_its_wakes() {
+    let mut running = recorded(50);
+    let verified = verified(&mut running);
     assert_eq!((verified.uncovered, verified.triggers), (0, 1), "{verified:?}");
     assert_eq!(verified.wakes, 51);
     running.end();
@@ -20,13 +31,10 @@ fn a_live_clip_is_verified_with_all_of_its_wakes() {
 
 #[test]
 fn a_wake_at_its_deadline_is_not_repeated_and_the_lambda_starts_again_after_it() {
-    let mut running = RecordedRun::start();
-    running.record_others();
-    running.burst(5);
+    let mut running = recorded(5);
     running.wake(SLOW);
     running.burst(5);
-    let clip = running.clip();
-    let verified = running.verify(clip).unwrap();
+    let verified = verified(&mut running);
     assert_eq!((verified.uncovered, verified.triggers, verified.wakes), (0, 2, 13), "{verified:?}");
     assert_eq!(verified.notes.len(), 1, "{verified:?}");
     assert!(verified.notes[0].starts_with("1 wake that exceeded the deadline"), "{verified:?}");
@@ -42,8 +50,7 @@ fn samples_that_are_larger_than_the_lambda_accepts_do_not_disturb() {
         running.burst(3);
         running.publish("/others", 2, 8);
     }
-    let clip = running.clip();
-    let verified = running.verify(clip).unwrap();
+    let verified = verified(&mut running);
     assert_eq!((verified.uncovered, verified.triggers), (0, 5), "{verified:?}");
     running.end();
 }
@@ -64,47 +71,38 @@ fn is_verified_after(earlier: i64, early: i64) {
     let mut running = RecordedRun::start_after(earlier, early);
     running.record_others();
     running.burst(5);
-    let clip = running.clip();
-    let verified = running.verify(clip).unwrap();
+    let verified = verified(&mut running);
     assert_eq!((verified.uncovered, verified.triggers), (0, 1), "{verified:?}");
     running.end();
 }
 
 #[test]
 fn a_clip_over_a_restart_of_the_ingress_is_verified_if_nothing_was_lost() {
-    let mut running = RecordedRun::start();
-    running.record_others();
-    running.burst(5);
+    let mut running = recorded(5);
     running.restart_ingress(0, 3);
     running.burst(3);
-    let clip = running.clip();
-    let verified = running.verify(clip).unwrap();
+    let verified = verified(&mut running);
     assert_eq!((verified.uncovered, verified.triggers, verified.wakes), (0, 2, 10), "{verified:?}");
     running.end();
 }
 
 #[test]
 fn samples_that_a_restarted_ingress_receives_again_are_repeated_in_the_verification() {
-    let mut running = RecordedRun::start();
-    running.record_others();
-    running.burst(5);
+    let mut running = recorded(5);
     running.restart_ingress(0, 0);
     // A writer with durability `transient_local` sends its last ones again.
     running.send_last_again();
     running.publish("/others", 5, 8);
     running.wake(TRIGGER);
     running.burst(3);
-    let clip = running.clip();
-    let verified = running.verify(clip).unwrap();
+    let verified = verified(&mut running);
     assert_eq!((verified.uncovered, verified.triggers, verified.wakes), (0, 3, 11), "{verified:?}");
     running.end();
 }
 
 #[test]
 fn a_clip_states_what_a_restart_of_the_ingress_has_lost_and_lambda_and_recorder_agree() {
-    let mut running = RecordedRun::start();
-    running.record_others();
-    running.burst(5);
+    let mut running = recorded(5);
     running.restart_ingress(7, 0);
     running.burst(3);
     let clip: Clip = running.next_clip();

@@ -10,9 +10,17 @@ mod host_time;
 mod limits;
 mod live;
 mod live_clips;
+mod live_layouts;
 mod misbehaving;
 mod own_process;
 mod recorded_run;
 mod schedule;
 mod small_limits;
 mod unrecorded;
+
+use gleaner_transport::{Guid, SampleMeta};
+
+/// Returns the metadata of a little-endian sample, which was published when it was received.
+fn meta(at_ns: i64, seq: u64) -> SampleMeta {
+    SampleMeta::new(at_ns, Guid::default(), seq)
+}

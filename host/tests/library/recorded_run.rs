@@ -23,7 +23,6 @@ use gleaner_host::session_setup::{ConfiguredLambda, RunMode};
 use gleaner_ingress::Ingress;
 use gleaner_lambda::manifest::{Limits, Manifest};
 use gleaner_lambda::{BuildDir, Clip, Fault, FaultKind};
-use gleaner_messages::Endian;
 use gleaner_messages::Sources;
 use gleaner_protocol::ingress::{
     AddReader, AddTopics, IngressControl, IngressReport, IngressStatus, IngressTopic, Qos,
@@ -395,16 +394,8 @@ fn publish(
     let sent = &mut sent[usize::from(topic == "/others")];
     *sent += 1;
     let at_ns = clock.now();
-    let meta = SampleMeta {
-        at_ns,
-        publish_ns: at_ns - 5,
-        writer: Guid([7; 16]),
-        seq: *sent,
-        endian: Endian::Little,
-        options: [0; 2],
-        layout: 0,
-        is_latched: false,
-    };
+    let writer = Guid([7; 16]);
+    let meta = SampleMeta { publish_ns: at_ns - 5, writer, ..crate::meta(at_ns, *sent) };
     let mut cdr = value.to_le_bytes().to_vec();
     cdr.resize(len, 0);
     loopback.publish(topic, &meta, &cdr).unwrap();
@@ -416,12 +407,10 @@ fn add_topics(loopback: &Loopback) {
     }
 }
 
-/// The recorder as a reader.
 fn recorder(topics: Vec<TopicGrant>) -> AddReader {
     AddReader { name: "recorder".to_owned(), topics, publishes: Vec::new() }
 }
 
-/// The lambda as a reader.
 fn adder(manifest: &Manifest) -> AddReader {
     let inputs = manifest.inputs.iter().zip(0..);
     let topics = inputs

@@ -9,10 +9,10 @@ use gleaner_host::api::data::{Sample, Topic, Wake};
 use gleaner_host::input::open_inputs;
 use gleaner_host::schedule::WakeSchedule;
 use gleaner_lambda::manifest::Manifest;
-use gleaner_messages::Endian;
 use gleaner_tests::root;
 use gleaner_transport::loopback::Loopback;
-use gleaner_transport::{Guid, SampleMeta};
+
+use crate::meta;
 
 const MS: i64 = 1_000_000;
 
@@ -78,17 +78,7 @@ impl EventFeed {
 
 fn send(transport: &mut Loopback, seq: u64, cdr: &[u8]) {
     let at_ns = seq as i64 * MS;
-    let meta = SampleMeta {
-        at_ns,
-        publish_ns: at_ns,
-        writer: Guid::default(),
-        seq,
-        endian: Endian::Little,
-        options: [0; 2],
-        layout: 0,
-        is_latched: false,
-    };
-    transport.publish("/imu/data", &meta, cdr).unwrap();
+    transport.publish("/imu/data", &meta(at_ns, seq), cdr).unwrap();
 }
 
 fn sample(wake: Wake) -> Sample {

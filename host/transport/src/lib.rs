@@ -6,6 +6,7 @@
 
 pub mod clock;
 mod gaps;
+mod latched;
 mod live;
 pub mod loopback;
 mod stored;
@@ -14,6 +15,7 @@ mod transport;
 pub use clock::Clock;
 pub use gaps::Gaps;
 pub use gleaner_protocol::ingress::{Health, Qos, ReceptionStatus};
+pub use latched::{LatchRule, LatchedSample, LatchedTopics, latched_depth};
 pub use live::{LiveSource, PublishError, Publisher};
 pub use stored::{ArrivalSums, STORED_WORDS, StoredMeta, TopicCounters};
 pub use transport::{

@@ -15,6 +15,13 @@ pub trait LiveSource: Transport + Send {
     /// The numbers of other subscriptions stay.
     fn unsubscribe(&mut self, subscription: Subscription);
 
+    /// Returns the hash (RIHS01) of the layout in which samples of a subscription are received;
+    /// those of writers that announce another one are left out. `None` while no writer has
+    /// announced one.
+    fn layout(&self, _subscription: Subscription) -> Option<String> {
+        None
+    }
+
     /// Starts a source that waits until all of its readers are ready, as a drive does.
     fn begin(&mut self) {}
 

@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 
 use gleaner_base::text::nearest;
-use gleaner_messages::{Definitions, Endian};
+use gleaner_messages::Definitions;
 
 use crate::Health;
 use crate::clock::Clock;
@@ -116,10 +116,8 @@ impl Transport for Loopback {
             topic: name.clone(),
             type_name: topic.type_name.clone(),
             definitions_text: topic.text.clone(),
-            type_hash: None,
-            other_definitions: Vec::new(),
             messages: Some(topic.messages),
-            offered_qos: None,
+            ..DiscoveredTopic::default()
         };
         self.lock().topics.iter().map(discovered).collect()
     }
@@ -203,17 +201,7 @@ impl Publisher for LoopbackPublisher {
     fn publish(&self, cdr: &[u8]) -> Result<(), PublishError> {
         let at_ns = self.clock.now();
         let seq = self.messages.fetch_add(1, Ordering::Relaxed) + 1;
-        let writer = Guid(*b"gleaner loopback");
-        let meta = SampleMeta {
-            at_ns,
-            publish_ns: at_ns,
-            writer,
-            seq,
-            endian: Endian::Little,
-            options: [0; 2],
-            layout: 0,
-            is_latched: false,
-        };
+        let meta = SampleMeta::new(at_ns, Guid(*b"gleaner loopback"), seq);
         self.loopback
             .publish(&self.topic, &meta, cdr)
             .map(drop)

@@ -176,16 +176,7 @@ mod tests {
 
     #[test]
     fn sums_differ_by_what_arrived_between_two_samples() {
-        let meta = |seq| SampleMeta {
-            at_ns: seq as i64,
-            publish_ns: 1,
-            writer: Guid::default(),
-            seq,
-            endian: Endian::Little,
-            options: [0; 2],
-            layout: 0,
-            is_latched: false,
-        };
+        let meta = |seq| SampleMeta::new(seq as i64, Guid::default(), seq);
         let (mut sums, mut later) = (ArrivalSums::default(), ArrivalSums::default());
         assert_eq!(sums.add(&meta(1), b"one").digests, 0, "digests are off");
         sums.enable_digests();

@@ -78,6 +78,23 @@ pub struct SampleMeta {
     pub is_latched: bool,
 }
 
+impl SampleMeta {
+    /// Metadata of a little-endian sample in the first layout of its topic, published at `at_ns`,
+    /// in ns. Other fields are set with `..`.
+    pub fn new(at_ns: i64, writer: Guid, seq: u64) -> SampleMeta {
+        SampleMeta {
+            at_ns,
+            publish_ns: at_ns,
+            writer,
+            seq,
+            endian: Endian::Little,
+            options: [0; 2],
+            layout: 0,
+            is_latched: false,
+        }
+    }
+}
+
 /// The result of delivering a sample to a sink.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Hash)]
 pub enum Delivery {
@@ -118,7 +135,7 @@ pub trait Sink: Send + Sync {
 }
 
 /// A topic of a source.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct DiscoveredTopic {
     /// Absolute topic name.
     pub topic: String,

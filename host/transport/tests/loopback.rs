@@ -5,23 +5,13 @@ mod support;
 
 use std::sync::Arc;
 
-use gleaner_messages::Endian;
 use gleaner_transport::loopback::Loopback;
 use gleaner_transport::{Delivery, Guid, SampleMeta, Subscription, Transport, TransportError};
 
 use support::{MemorySink, TEXT, TYPE, spec};
 
 fn meta(at_ns: i64) -> SampleMeta {
-    SampleMeta {
-        at_ns,
-        publish_ns: 0,
-        writer: Guid([7; 16]),
-        seq: 1,
-        endian: Endian::Little,
-        options: [0; 2],
-        layout: 0,
-        is_latched: false,
-    }
+    SampleMeta::new(at_ns, Guid([7; 16]), 1)
 }
 
 #[test]

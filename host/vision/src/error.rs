@@ -1,7 +1,5 @@
 //! Errors of frames, tensors and outputs of models, with their messages for users.
 
-use std::fmt::Write;
-
 use gleaner_rules::pixels::{Encoding, PixelError};
 
 use crate::prepare::MAX_TENSOR_SIDE;
@@ -180,21 +178,11 @@ pub(crate) fn shortened(name: &str) -> String {
 
 /// Formats a shape, such as `[1, 84, ?]`.
 pub(crate) fn shape_text(shape: impl IntoIterator<Item = Option<u32>>) -> String {
-    let mut text = String::from("[");
-    for (index, length) in shape.into_iter().enumerate() {
-        let separator = if index == 0 { "" } else { ", " };
-        if index == LISTED_DIMENSIONS {
-            text.push_str(", …");
-            break;
-        }
-        // Writing to a string does not fail.
-        let _ = match length {
-            Some(length) => write!(text, "{separator}{length}"),
-            None => write!(text, "{separator}?"),
-        };
-    }
-    text.push(']');
-    text
+    let text_of = |length: Option<u32>| length.map_or("?".to_owned(), |it| it.to_string());
+    let mut lengths = shape.into_iter().map(text_of);
+    let mut listed: Vec<String> = lengths.by_ref().take(LISTED_DIMENSIONS).collect();
+    listed.extend(lengths.next().map(|_| "…".to_owned()));
+    format!("[{}]", listed.join(", "))
 }
 
 #[cfg(test)]

@@ -16,9 +16,6 @@ pub struct ExportNote {
 }
 
 impl ExportNote {
-    /// The keys that are read.
-    pub const KEYS: [&'static str; 5] = ["task", "head", "stride", "end2end", "names"];
-
     /// Reads entries of metadata. Other keys are skipped, and so is a value in another form.
     pub fn of<'a>(entries: impl IntoIterator<Item = (&'a str, &'a str)>) -> Self {
         let mut note = Self::default();
@@ -66,23 +63,16 @@ fn names(text: &str) -> Option<Vec<String>> {
         }
         let value = value.trim_start();
         let quote = value.chars().next().filter(|quote| matches!(quote, '\'' | '"'))?;
-        let (mut name, mut is_escaped, mut end) = (String::new(), false, None);
-        for (at, letter) in value.char_indices().skip(1) {
-            match letter {
-                '\\' if !is_escaped => {
-                    is_escaped = true;
-                    continue;
-                }
-                _ if letter == quote && !is_escaped => {
-                    end = Some(at);
-                    break;
-                }
-                _ => name.push(letter),
+        let (mut name, mut letters) = (String::new(), value[1..].chars());
+        loop {
+            match letters.next()? {
+                '\\' => name.push(letters.next()?),
+                letter if letter == quote => break,
+                letter => name.push(letter),
             }
-            is_escaped = false;
         }
         names.push(name);
-        rest = value[end? + 1..].trim_start();
+        rest = letters.as_str().trim_start();
         rest = rest.strip_prefix(',').unwrap_or(rest).trim_start();
     }
     Some(names)

@@ -113,39 +113,28 @@ impl<'a> DetectorHead<'a> {
 
     /// Returns the edges of the box of an anchor. They may be any numbers, even NaN.
     pub(crate) fn edges(&self, anchor: usize) -> Edges {
-        let numbers = self.form.numbers;
+        let row = &self.values[anchor * self.form.numbers..][..self.form.numbers];
+        let cell = || self.cell(anchor).unwrap_or((f32::NAN, f32::NAN, f32::NAN));
         match self.form.layout {
             DetectorLayout::Ultralytics if self.form.by_number => {
                 around([0, 1, 2, 3].map(|number| self.row(number)[anchor]))
             }
-            DetectorLayout::Ultralytics => {
-                let row = &self.values[anchor * numbers..];
-                around([row[0], row[1], row[2], row[3]])
-            }
+            DetectorLayout::Ultralytics => around([row[0], row[1], row[2], row[3]]),
             DetectorLayout::Yolox => {
-                let row = &self.values[anchor * numbers..];
-                let Some((x, y, stride)) = self.cell(anchor) else {
-                    return [f32::NAN; 4];
-                };
+                let (x, y, stride) = cell();
                 let centre = [(row[0] + x) * stride, (row[1] + y) * stride];
                 around([centre[0], centre[1], row[2].exp() * stride, row[3].exp() * stride])
             }
             DetectorLayout::Nanodet => {
-                let row = &self.values[anchor * numbers..][..numbers];
-                let Some((x, y, stride)) = self.cell(anchor) else {
-                    return [f32::NAN; 4];
-                };
-                let bins = &row[numbers - SIDES * BINS..];
+                let (x, y, stride) = cell();
+                let bins = &row[row.len() - SIDES * BINS..];
                 let [left, top, right, bottom] =
                     [0, 1, 2, 3].map(|side| distance(&bins[side * BINS..][..BINS]) * stride);
                 // Unlike in other detectors, the point of a cell is its corner.
                 let (x, y) = (x * stride, y * stride);
                 [x - left, y - top, x + right, y + bottom]
             }
-            DetectorLayout::NmsFree => {
-                let row = &self.values[anchor * numbers..];
-                [row[0], row[1], row[2], row[3]]
-            }
+            DetectorLayout::NmsFree => [row[0], row[1], row[2], row[3]],
         }
     }
 

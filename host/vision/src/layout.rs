@@ -17,8 +17,8 @@ pub(crate) const BINS: usize = 8;
 /// Numbers of a row of an NMS-free detector: box, score, class.
 const NMS_FREE_ROW: u32 = 6;
 
-/// Strides of the grids of YOLOX, and usual ones of Ultralytics.
-const YOLOX_STRIDES: &[u32] = &[8, 16, 32];
+/// Usual strides of grids.
+const STRIDES: &[u32] = &[8, 16, 32];
 
 /// Strides of the models P2 and P6 of Ultralytics, whose metadata has the largest.
 const P2_STRIDES: &[u32] = &[4, 8, 16, 32];
@@ -29,9 +29,6 @@ const RT_DETR_ROWS: u32 = 300;
 
 /// Anchors of a cell in YOLOv5 and YOLOv7.
 const YOLO_V5_ANCHORS: u64 = 3;
-
-/// Strides of the grids of NanoDet-Plus; older ones lack the last.
-const NANODET_STRIDES: &[u32] = &[8, 16, 32, 64];
 
 /// The family of a detector, which determines its input and the meaning of its output.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -158,14 +155,15 @@ impl DetectorLayout {
     ) -> Result<Option<u32>, VisionError> {
         let fixed = |shape: &[Option<u32>]| shape.iter().copied().collect::<Option<Vec<u32>>>();
         let shapes = outputs.iter().filter_map(|shape| fixed(shape)).collect::<Vec<_>>();
-        let kind = note.foreign_kind().or_else(|| self.foreign_shape(&shapes, (width, height)));
-        if let Some(kind) = kind {
+        let of_shape = || self.foreign_shape(&shapes, (width, height)).map(str::to_owned);
+        if let Some(kind) = note.foreign_kind().or_else(of_shape) {
             return Err(VisionError::OtherModel { layout: self.name(), kind });
         }
-        let has_stride = |form: &Form| {
-            form.strides == YOLOX_STRIDES || note.stride == form.strides.last().copied()
+        let is_proven = |form: &Form| {
+            self != Self::Ultralytics
+                || form.strides == STRIDES
+                || note.stride == form.strides.last().copied()
         };
-        let is_proven = |form: &Form| self != Self::Ultralytics || has_stride(form);
         let form = match *outputs {
             [shape] => match fixed(shape) {
                 Some(shape) => self.form_of(&shape, (width, height)).filter(is_proven),
@@ -180,31 +178,23 @@ impl DetectorLayout {
     }
 
     /// Returns the kind of a model that no layout decodes, if the shapes of its outputs show it.
-    fn foreign_shape(self, shapes: &[Vec<u32>], input: (u32, u32)) -> Option<String> {
-        let cells = cells(YOLOX_STRIDES, input);
-        let kind = match shapes {
-            [first, masks] if first.len() == 3 && masks.len() == 4 => "a segmentation model",
-            [shape] => match shape[..] {
-                [1, rows, columns]
-                    if columns > 5
-                        && [YOLOX_STRIDES, P6_STRIDES].iter().any(|strides| {
-                            u64::from(rows) == YOLO_V5_ANCHORS * self::cells(strides, input)
-                        }) =>
-                {
-                    "YOLOv5 or YOLOv7, with three anchors in each cell"
-                }
-                [1, RT_DETR_ROWS, columns]
-                    if self == Self::Ultralytics
-                        && columns > NMS_FREE_ROW
-                        && ![u64::from(RT_DETR_ROWS), u64::from(columns)].contains(&cells) =>
-                {
-                    "RT-DETR, with 300 rows"
-                }
-                _ => return None,
-            },
+    fn foreign_shape(self, shapes: &[Vec<u32>], input: (u32, u32)) -> Option<&'static str> {
+        let shape = match shapes {
+            [first, masks] if first.len() == 3 && masks.len() == 4 => {
+                return Some("a segmentation model");
+            }
+            [shape] => shape,
             _ => return None,
         };
-        Some(kind.to_owned())
+        let [1, rows, columns] = shape[..] else { return None };
+        let [usual, p6] = [STRIDES, P6_STRIDES].map(|strides| cells(strides, input));
+        let is_v5 = [usual, p6].map(|cells| YOLO_V5_ANCHORS * cells).contains(&rows.into());
+        let is_ultralytics = [rows, columns].map(u64::from).contains(&usual);
+        if columns > 5 && is_v5 {
+            return Some("YOLOv5 or YOLOv7, with three anchors in each cell");
+        }
+        let is_rt_detr = self == Self::Ultralytics && rows == RT_DETR_ROWS && !is_ultralytics;
+        (is_rt_detr && columns > NMS_FREE_ROW).then_some("RT-DETR, with 300 rows")
     }
 
     /// Returns the form of an output of `shape`.
@@ -215,18 +205,12 @@ impl DetectorLayout {
 
     /// Returns the error for outputs with the shapes `found`.
     pub(crate) fn refusal(self, (width, height): (u32, u32), found: String) -> VisionError {
-        let cells = |strides| cells(strides, (width, height));
+        let [usual, all] = [STRIDES, P6_STRIDES].map(|strides| cells(strides, (width, height)));
         let expected = match self {
-            Self::Ultralytics => {
-                format!("[1, 4 + classes, {}], or transposed", cells(YOLOX_STRIDES))
-            }
-            Self::Yolox => format!("[1, {}, 5 + classes]", cells(YOLOX_STRIDES)),
+            Self::Ultralytics => format!("[1, 4 + classes, {usual}], or transposed"),
+            Self::Yolox => format!("[1, {usual}, 5 + classes]"),
             Self::NmsFree => "[1, rows, 6]".to_owned(),
-            Self::Nanodet => format!(
-                "[1, {}, classes + 32] or [1, {}, classes + 32]",
-                cells(NANODET_STRIDES),
-                cells(&NANODET_STRIDES[..3])
-            ),
+            Self::Nanodet => format!("[1, {all}, classes + 32] or [1, {usual}, classes + 32]"),
         };
         let found = if found.is_empty() { "no output".to_owned() } else { found };
         VisionError::OutputShape { layout: self.name(), expected, width, height, found }
@@ -236,38 +220,41 @@ impl DetectorLayout {
         let [1, rows, columns] = *shape else {
             return None;
         };
-        let cells = |strides| cells(strides, input);
-        let by_number = self == Self::Ultralytics && is_by_number(rows, columns, input);
+        let strides_of = |length: u32| {
+            let is_it = |strides: &&[u32]| cells(strides, input) == u64::from(length);
+            self.grids().iter().copied().find(is_it)
+        };
+        // An output has a row for each number, or, transposed, for each anchor.
+        let by_number = self == Self::Ultralytics
+            && (strides_of(columns).is_some() || strides_of(rows).is_none());
         let (anchors, numbers) = if by_number { (columns, rows) } else { (rows, columns) };
-        let strides = match self {
-            Self::Ultralytics => [YOLOX_STRIDES, P2_STRIDES, P6_STRIDES]
-                .into_iter()
-                .find(|strides| cells(strides) == u64::from(anchors))?,
-            Self::NmsFree if numbers == NMS_FREE_ROW => &[],
-            Self::Yolox if cells(YOLOX_STRIDES) == u64::from(anchors) => YOLOX_STRIDES,
-            Self::Nanodet => [NANODET_STRIDES, &NANODET_STRIDES[..3]]
-                .into_iter()
-                .find(|strides| cells(strides) == u64::from(anchors))?,
-            _ => return None,
+        let scores = numbers.checked_sub(match self {
+            Self::Ultralytics => 4,
+            Self::Yolox => 5,
+            Self::NmsFree => NMS_FREE_ROW,
+            Self::Nanodet => 32,
+        })?;
+        let (strides, classes): (&'static [u32], Option<u32>) = match self {
+            Self::NmsFree => (&[], None),
+            _ => (strides_of(anchors)?, Some(scores)),
         };
-        let classes = match self {
-            Self::Ultralytics => Some(numbers.checked_sub(4).filter(|classes| *classes > 0)?),
-            Self::Yolox => Some(numbers.checked_sub(5).filter(|classes| *classes > 0)?),
-            Self::Nanodet => Some(numbers.checked_sub(32).filter(|classes| *classes > 0)?),
-            Self::NmsFree => None,
-        };
+        if classes.is_none() != (scores == 0) {
+            return None;
+        }
         let (anchors, numbers) = (anchors as usize, numbers as usize);
         Some(Form { layout: self, anchors, numbers, classes, by_number, strides })
     }
-}
 
-/// Returns whether an output [1, `rows`, `columns`] of Ultralytics has a row for each number.
-fn is_by_number(rows: u32, columns: u32, input: (u32, u32)) -> bool {
-    let is_anchors = |length: u32| {
-        let grids = [YOLOX_STRIDES, P2_STRIDES, P6_STRIDES];
-        grids.iter().any(|strides| cells(strides, input) == u64::from(length))
-    };
-    is_anchors(columns) || !is_anchors(rows)
+    /// Returns the strides of the grids that a model of this family may have.
+    fn grids(self) -> &'static [&'static [u32]] {
+        match self {
+            Self::Ultralytics => &[STRIDES, P2_STRIDES, P6_STRIDES],
+            Self::Yolox => &[STRIDES],
+            Self::NmsFree => &[],
+            // Older ones lack the last grid.
+            Self::Nanodet => &[P6_STRIDES, STRIDES],
+        }
+    }
 }
 
 /// Returns the number of cells of all grids.
@@ -279,12 +266,25 @@ fn cells(strides: &[u32], (width, height): (u32, u32)) -> u64 {
 
 #[cfg(test)]
 mod tests {
+    use super::DetectorLayout::{Nanodet, NmsFree, Ultralytics, Yolox};
     use super::*;
 
-    const INPUT: (u32, u32) = (416, 416);
+    /// Checks outputs of fixed shapes for an input of `side` x `side` pixels.
+    fn check(
+        layout: DetectorLayout,
+        shapes: &[&[u32]],
+        side: u32,
+        note: &[(&str, &str)],
+    ) -> Result<Option<u32>, String> {
+        let fixed = |shape: &&[u32]| shape.iter().copied().map(Some).collect::<Vec<_>>();
+        let shapes: Vec<_> = shapes.iter().map(fixed).collect();
+        let shapes: Vec<_> = shapes.iter().map(Vec::as_slice).collect();
+        let note = ExportNote::of(note.iter().copied());
+        layout.check(&shapes, (side, side), &note).map_err(|error| error.to_string())
+    }
 
-    fn refusal(layout: DetectorLayout, outputs: &[&[Option<u32>]]) -> String {
-        layout.check(outputs, INPUT, &ExportNote::default()).unwrap_err().to_string()
+    fn refusal(layout: DetectorLayout, shapes: &[&[u32]]) -> String {
+        check(layout, shapes, 416, &[]).unwrap_err()
     }
 
     #[test]
@@ -302,16 +302,13 @@ mod tests {
 
     #[test]
     fn the_input_determines_size_and_order() {
-        let how =
-            DetectorLayout::Yolox.preprocess(&[Some(1), Some(3), Some(320), Some(416)]).unwrap();
+        let how = Yolox.preprocess(&[Some(1), Some(3), Some(320), Some(416)]).unwrap();
         assert_eq!((how.width, how.height, how.channels_last, how.bgr), (416, 320, false, true));
         assert_eq!((how.placement, how.fill, how.scale), (Placement::Corner, 114, 1.0));
-        let how =
-            DetectorLayout::Ultralytics.preprocess(&[None, Some(320), Some(416), Some(3)]).unwrap();
+        let how = Ultralytics.preprocess(&[None, Some(320), Some(416), Some(3)]).unwrap();
         assert_eq!((how.width, how.height, how.channels_last, how.bgr), (416, 320, true, false));
         assert_eq!((how.placement, how.scale), (Placement::Centre, 1.0 / 255.0));
-        let how =
-            DetectorLayout::Nanodet.preprocess(&[Some(1), Some(3), Some(416), Some(416)]).unwrap();
+        let how = Nanodet.preprocess(&[Some(1), Some(3), Some(416), Some(416)]).unwrap();
         assert_eq!(
             (how.placement, how.mean[0], how.deviation[2]),
             (Placement::Stretch, 103.53, 58.395)
@@ -320,9 +317,7 @@ mod tests {
 
     #[test]
     fn another_input_is_refused() {
-        let error = |input: &[Option<u32>]| {
-            DetectorLayout::Yolox.preprocess(input).unwrap_err().to_string()
-        };
+        let error = |input: &[Option<u32>]| Yolox.preprocess(input).unwrap_err().to_string();
         assert_eq!(
             error(&[Some(1), Some(1), Some(28), Some(28)]),
             "layout `yolox` needs one input [1, 3, height, width] or [1, height, width, 3]; \
@@ -343,35 +338,32 @@ mod tests {
 
     #[test]
     fn the_outputs_show_the_number_of_classes() {
-        let classes = |layout: DetectorLayout, shape: [u32; 3]| {
-            layout.check(&[&shape.map(Some)], INPUT, &ExportNote::default()).unwrap()
-        };
-        assert_eq!(classes(DetectorLayout::Yolox, [1, 3549, 85]), Some(80));
-        assert_eq!(classes(DetectorLayout::Ultralytics, [1, 84, 3549]), Some(80));
-        assert_eq!(classes(DetectorLayout::Ultralytics, [1, 3549, 84]), Some(80));
-        assert_eq!(classes(DetectorLayout::NmsFree, [1, 300, 6]), None);
-        assert_eq!(classes(DetectorLayout::NmsFree, [1, 0, 6]), None);
-        assert_eq!(classes(DetectorLayout::Nanodet, [1, 3598, 112]), Some(80));
-        assert_eq!(classes(DetectorLayout::Nanodet, [1, 3549, 33]), Some(1));
+        let classes = |layout, shape: [u32; 3]| check(layout, &[&shape], 416, &[]).unwrap();
+        assert_eq!(classes(Yolox, [1, 3549, 85]), Some(80));
+        assert_eq!(classes(Ultralytics, [1, 84, 3549]), Some(80));
+        assert_eq!(classes(Ultralytics, [1, 3549, 84]), Some(80));
+        assert_eq!(classes(NmsFree, [1, 300, 6]), None);
+        assert_eq!(classes(NmsFree, [1, 0, 6]), None);
+        assert_eq!(classes(Nanodet, [1, 3598, 112]), Some(80));
+        assert_eq!(classes(Nanodet, [1, 3549, 33]), Some(1));
         let dynamic: &[Option<u32>] = &[None, Some(84), None];
         let none = ExportNote::default();
-        assert_eq!(DetectorLayout::Ultralytics.check(&[dynamic], INPUT, &none), Ok(None));
+        assert_eq!(Ultralytics.check(&[dynamic], (416, 416), &none), Ok(None));
     }
 
     #[test]
     fn other_outputs_are_refused_with_both_shapes() {
-        let shape = |lengths: &[u32]| lengths.iter().copied().map(Some).collect::<Vec<_>>();
         assert_eq!(
-            refusal(DetectorLayout::Yolox, &[&shape(&[1, 2100, 85])]),
+            refusal(Yolox, &[&[1, 2100, 85]]),
             "layout `yolox` needs one output [1, 3549, 5 + classes] for an input of 416x416; \
              the model has [1, 2100, 85]"
         );
         assert_eq!(
-            refusal(DetectorLayout::Ultralytics, &[&shape(&[1, 84, 3549]), &shape(&[1, 7])]),
+            refusal(Ultralytics, &[&[1, 84, 3549], &[1, 7]]),
             "layout `ultralytics` needs one output [1, 4 + classes, 3549], or transposed for an \
              input of 416x416; the model has [1, 84, 3549], [1, 7]"
         );
-        assert!(refusal(DetectorLayout::NmsFree, &[]).ends_with("the model has no output"));
+        assert!(refusal(NmsFree, &[]).ends_with("the model has no output"));
         for layout in DetectorLayout::ALL {
             for lengths in [
                 &[][..],
@@ -384,7 +376,7 @@ mod tests {
                 &[2, 3549, 85],
                 &[1, 3549, 85, 1],
             ] {
-                let message = refusal(layout, &[&shape(lengths)]);
+                let message = refusal(layout, &[lengths]);
                 assert!(message.contains(&format!("{lengths:?}")), "{layout:?} {message}");
             }
         }
@@ -392,35 +384,29 @@ mod tests {
 
     #[test]
     fn models_of_other_families_are_refused_by_name() {
-        let check = |layout: DetectorLayout, shapes: &[&[u32]], note: &[(&str, &str)]| {
-            let shapes: Vec<Vec<_>> =
-                shapes.iter().map(|shape| shape.iter().copied().map(Some).collect()).collect();
-            let shapes: Vec<_> = shapes.iter().map(Vec::as_slice).collect();
-            let note = ExportNote::of(note.iter().copied());
-            layout.check(&shapes, (640, 640), &note).map_err(|error| error.to_string())
-        };
-        let (ultralytics, nms_free) = (DetectorLayout::Ultralytics, DetectorLayout::NmsFree);
+        let check =
+            |layout, shapes: &[&[u32]], note: &[(&str, &str)]| check(layout, shapes, 640, note);
         let head = [("task", "detect"), ("head", "RTDETRDecoder")];
         for (layout, shapes, note, kind) in [
-            (ultralytics, &[&[1, 25200, 85][..]][..], &[][..], "YOLOv5 or YOLOv7"),
-            (ultralytics, &[&[1, 25_500, 85]], &[], "YOLOv5 or YOLOv7"),
-            (ultralytics, &[&[1, 300, 84]], &[], "RT-DETR"),
-            (nms_free, &[&[1, 300, 6]], &head, "RT-DETR"),
-            (ultralytics, &[&[1, 300, 84]], &head, "RT-DETR"),
-            (ultralytics, &[&[1, 56, 8400]], &[("task", "pose")], "for task `pose`"),
-            (ultralytics, &[&[1, 20, 8400]], &[("task", "obb")], "for task `obb`"),
-            (ultralytics, &[&[1, 116, 8400], &[1, 32, 160, 160]], &[], "a segmentation model"),
+            (Ultralytics, &[&[1, 25200, 85][..]][..], &[][..], "YOLOv5 or YOLOv7"),
+            (Ultralytics, &[&[1, 25_500, 85]], &[], "YOLOv5 or YOLOv7"),
+            (Ultralytics, &[&[1, 300, 84]], &[], "RT-DETR"),
+            (NmsFree, &[&[1, 300, 6]], &head, "RT-DETR"),
+            (Ultralytics, &[&[1, 300, 84]], &head, "RT-DETR"),
+            (Ultralytics, &[&[1, 56, 8400]], &[("task", "pose")], "for task `pose`"),
+            (Ultralytics, &[&[1, 20, 8400]], &[("task", "obb")], "for task `obb`"),
+            (Ultralytics, &[&[1, 116, 8400], &[1, 32, 160, 160]], &[], "a segmentation model"),
         ] {
             let message = check(layout, shapes, note).unwrap_err();
             assert!(message.contains(kind) && message.contains("call `run`"), "{message}");
         }
-        assert_eq!(check(ultralytics, &[&[1, 84, 8400]], &[("task", "detect")]), Ok(Some(80)));
-        assert_eq!(check(nms_free, &[&[1, 300, 6]], &[("end2end", "True")]), Ok(None));
+        assert_eq!(check(Ultralytics, &[&[1, 84, 8400]], &[("task", "detect")]), Ok(Some(80)));
+        assert_eq!(check(NmsFree, &[&[1, 300, 6]], &[("end2end", "True")]), Ok(None));
         // Grids with strides 4 to 32, and 8 to 64: 640x640 gives 34000 and 8500 cells.
         for (anchors, stride) in [(34_000, "32"), (8500, "64")] {
             let shape: &[&[u32]] = &[&[1, 84, anchors]];
-            assert_eq!(check(ultralytics, shape, &[("stride", stride)]), Ok(Some(80)));
-            assert!(check(ultralytics, shape, &[]).unwrap_err().contains("8400"));
+            assert_eq!(check(Ultralytics, shape, &[("stride", stride)]), Ok(Some(80)));
+            assert!(check(Ultralytics, shape, &[]).unwrap_err().contains("8400"));
         }
     }
 }

@@ -26,4 +26,4 @@ pub use error::VisionError;
 pub use export::ExportNote;
 pub use layout::DetectorLayout;
 pub use placement::{Placed, Placement};
-pub use prepare::{MAX_TENSOR_SIDE, Preparer, Preprocess, prepare};
+pub use prepare::{MAX_TENSOR_SIDE, Preparer, Preprocess};

@@ -220,16 +220,3 @@ fn fill_line<T: Copy>(
         *value = convert(*pixel);
     }
 }
-
-/// Writes the tensor of `view` to `out`, as [`Preparer::prepare`] does, with buffers of its own.
-///
-/// # Errors
-///
-/// As for [`Preparer::prepare`].
-pub fn prepare(
-    view: &View<'_>,
-    how: &Preprocess,
-    out: &mut Vec<u8>,
-) -> Result<Placed, VisionError> {
-    Preparer::new().prepare(view, how, out)
-}

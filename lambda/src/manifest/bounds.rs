@@ -136,5 +136,5 @@ pub const MODEL_SHARE: Bounds<f64> = CPU_SHARE;
 /// Longest accepted manifest. The longest in use has 3 KiB.
 pub const MANIFEST_MAX: ByteSize = ByteSize::mib(1);
 
-/// Maximum number of inputs, models, config items or recorded topics of one lambda.
+/// Maximum number of inputs, models, config items, recorded topics or `files` of one lambda.
 pub const ITEMS_MAX: usize = 256;

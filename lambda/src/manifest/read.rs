@@ -12,11 +12,16 @@ use super::table::{Document, TomlTable};
 use super::value::TomlValue;
 use super::{
     Backlog, ByteSize, Durability, InputSpec, LambdaKind, LambdaSection, Limits, Manifest,
-    ModelSpec, Qos, RecordSpec, Reliability, ScheduleSpec, Store, TopicName, TypeName,
+    ModelSpec, Qos, RecordSpec, RelativePath, Reliability, ScheduleSpec, Store, TopicName,
+    TypeName,
 };
 use gleaner_base::text::{excerpt, nearest};
 
 type Result<T> = std::result::Result<T, ManifestError>;
+
+/// Names that Gleaner writes: into a build, beside a build, and beside one on a vehicle.
+const WRITTEN: [&str; 7] =
+    ["lambda.toml", "wheels", "build", "out", "live", "revision.json", "environment"];
 
 /// Parses the manifest in `document`.
 pub(super) fn manifest(document: &Document) -> Result<Manifest> {
@@ -54,8 +59,8 @@ pub(super) fn manifest(document: &Document) -> Result<Manifest> {
 }
 
 fn lambda(value: &TomlValue) -> Result<LambdaSection> {
-    let table = value
-        .table("[lambda]", &["name", "version", "kind", "entry", "description", "deterministic"])?;
+    let known = &["name", "version", "kind", "entry", "files", "description", "deterministic"];
+    let table = value.table("[lambda]", known)?;
     let lambda = LambdaSection {
         name: table.need("name", "name = \"brake-dark\"")?.parse()?,
         version: table.need("version", "version = \"0.1.0\"")?.parse()?,
@@ -65,16 +70,37 @@ fn lambda(value: &TomlValue) -> Result<LambdaSection> {
         entry: table
             .need("entry", "entry = \"brake_dark.wasm\", or entry = \"main.py\" for Python")?
             .parse()?,
+        files: table.get("files").map_or(Ok(Vec::new()), |value| data_files(&value))?,
         description: table.optional_text("description")?,
         deterministic: table.flag("deterministic")?,
     };
-    match table.get("deterministic") {
-        Some(value) if lambda.kind == LambdaKind::Python => Err(value.misplaced(
-            "has no meaning with kind = \"python\"",
-            "remove it: Python's numbers are those of the machine",
-        )),
-        _ => Ok(lambda),
-    }
+    let (key, instead) = match lambda.kind {
+        LambdaKind::Python => ("deterministic", "Python's numbers are those of the machine"),
+        LambdaKind::Wasm => ("files", "put them into `src/`, and use `include_bytes!`"),
+    };
+    let Some(value) = table.get(key) else { return Ok(lambda) };
+    let why = format!("has no meaning with kind = \"{}\"", lambda.kind.as_str());
+    Err(value.misplaced(why, format!("remove it: {instead}")))
+}
+
+fn data_files(value: &TomlValue) -> Result<Vec<RelativePath>> {
+    let items = value.items("an array of paths, for example [\"anchors.json\"]")?;
+    items.iter().map(data_file).collect()
+}
+
+fn data_file(value: &TomlValue) -> Result<RelativePath> {
+    let path: RelativePath = value.parse()?;
+    let text = path.as_str();
+    let (why, help) = if text.split('/').next().is_some_and(|top| WRITTEN.contains(&top)) {
+        ("which Gleaner itself writes", "give the data another name")
+    } else if text.split('/').any(|part| part.starts_with('.')) {
+        ("which is hidden", "give it a name that does not begin with a dot")
+    } else if text.contains(['*', '?']) {
+        ("which is a pattern", "name each file, or their folder")
+    } else {
+        return Ok(path);
+    };
+    Err(value.misplaced(format!("names `{}`, {why}", excerpt(text)), help))
 }
 
 fn schedule(value: &TomlValue, inputs: &[InputSpec]) -> Result<ScheduleSpec> {

@@ -156,11 +156,13 @@ fn lambda() -> Section {
         Key::new("version", "LambdaSection", "version", rule::<Version>()).needed(),
         Key::new("kind", "LambdaSection", "kind", "`\"wasm\"`, `\"python\"`").needed(),
         Key::new("entry", "LambdaSection", "entry", rule::<RelativePath>()).needed(),
+        Key::new("files", "LambdaSection", "files", "list of paths").default("empty"),
         Key::new("description", "LambdaSection", "description", "text"),
         Key::new("deterministic", "LambdaSection", "deterministic", "`true`, `false`")
             .default("`false`"),
     ];
-    Section { title: "[lambda]", note: "Identity and code. Required.".to_owned(), keys }
+    let note = "Identity and code. Required. [Data files](python.md#data-files) describes `files`.";
+    Section { title: "[lambda]", note: note.to_owned(), keys }
 }
 
 fn schedule() -> Section {

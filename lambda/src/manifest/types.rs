@@ -48,6 +48,10 @@ pub struct LambdaSection {
     pub kind: LambdaKind,
     /// File to load, relative to the build folder: the component, or the Python file.
     pub entry: RelativePath,
+    /// Data files and folders of a Python lambda, relative to its folder. The build has them under
+    /// the same paths.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub files: Vec<RelativePath>,
     /// One-line description.
     pub description: Option<String>,
     /// True to give every NaN of a component the same bits on every CPU, at a cost in speed.

@@ -96,7 +96,6 @@ impl Api {
         Router::new().route("/metrics", get(prometheus)).with_state(self)
     }
 
-    /// Returns the status of the vehicle.
     pub(crate) fn status(&self) -> VehicleStatus {
         let (deployments, supervisor, generation) = self.core.status();
         let labels = self.core.trust(|trust| trust.labels().clone());

@@ -479,7 +479,6 @@ impl Inner {
         self.measured.model().of(self.manifests.get(id)?)
     }
 
-    /// Returns the demand of each wanted lambda.
     pub(crate) fn wanted_demand(&self) -> BTreeMap<ItemName, LambdaDemand> {
         let wanted = self.state.deployments.iter().filter(|(_, deployed)| deployed.is_wanted);
         wanted.filter_map(|(id, _)| Some((id.clone(), self.demand(id)?))).collect()

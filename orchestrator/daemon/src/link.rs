@@ -46,7 +46,6 @@ const SILENT_MAX: u32 = 3;
 /// Time for the supervisor to end all processes.
 const END: Duration = Duration::from_secs(60);
 
-/// The link.
 pub(crate) struct SupervisorLink {
     pub(crate) core: Arc<Core>,
     pub(crate) layout: VehicleFolders,
@@ -57,7 +56,6 @@ pub(crate) struct SupervisorLink {
     pub(crate) stop: watch::Receiver<bool>,
 }
 
-/// The end of a connection.
 enum LinkEnd {
     /// The supervisor has ended, as requested.
     Stopped,
@@ -133,7 +131,6 @@ impl SupervisorLink {
         }
     }
 
-    /// Connects to the supervisor, or starts one.
     async fn connect(&self) -> Result<UnixStream, Failure> {
         let path = self.layout.supervisor_socket();
         let until = tokio::time::Instant::now() + CONNECT;
@@ -303,7 +300,6 @@ fn is_supervisor(pid: Pid) -> bool {
     name.is_some_and(|name| name.trim_end_matches(" (deleted)") == "gleaner-supervisor")
 }
 
-/// Waits until `stop` is set.
 async fn is_set(stop: &mut watch::Receiver<bool>) {
     // An error means that the sender is gone: this program is replaced after SIGHUP, and the
     // supervisor must go on.

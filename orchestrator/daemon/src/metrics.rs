@@ -18,7 +18,6 @@ const LAMBDA: [(&str, &str, &str); 10] = [
     ("wake_latency_p99_seconds", "gauge", "99th percentile of the wake latency, of a second"),
 ];
 
-/// Returns the text.
 pub(crate) fn text(status: &VehicleStatus) -> String {
     let mut text = String::new();
     let program = &status.orchestrator;

@@ -44,11 +44,8 @@ impl VehicleState {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Deployed {
-    /// Its envelope.
     pub(crate) envelope: String,
-    /// Name of its lambda.
     pub(crate) lambda: LambdaName,
-    /// Number of its release.
     pub(crate) release: u64,
     /// Number of the attempt to run it: it grows with each deployment, rollback and start.
     pub(crate) attempt: u64,

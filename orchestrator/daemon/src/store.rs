@@ -32,7 +32,6 @@ const ENVELOPE: &str = "revision.json";
 /// The path of each file of each revision, by its digest.
 pub(crate) type KnownFiles = BTreeMap<String, PathBuf>;
 
-/// The store.
 #[derive(Debug, Clone)]
 pub(crate) struct RevisionStore {
     objects: PathBuf,

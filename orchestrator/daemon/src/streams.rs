@@ -15,7 +15,6 @@ use tokio::sync::mpsc;
 
 use crate::api::StreamQuery;
 
-/// The streams of events.
 pub(crate) const STREAMS: [&str; 2] = ["events", "orchestrator"];
 /// Interval of looks for new records.
 const INTERVAL: Duration = Duration::from_millis(100);
@@ -25,7 +24,6 @@ const QUEUE: usize = 16;
 const PIECE: usize = 256;
 /// Maximum number of streams that are read at a time.
 const OPEN_MAX: usize = 32;
-/// Maximum of `last`.
 const LAST_MAX: usize = 10_000;
 
 /// Returns the lines of the streams `names` in the folder `spool`, those of several by boot and by

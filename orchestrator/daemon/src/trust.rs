@@ -12,7 +12,6 @@ use gleaner_trust::{
 use crate::durable::DurableFile;
 use crate::layout::VehicleFolders;
 
-/// The trust of a vehicle.
 #[derive(Debug)]
 pub(crate) struct VehicleTrust {
     root: Option<TrustRoot>,

@@ -31,17 +31,14 @@ pub struct Handover {
     pub key: Option<OwnedFd>,
 }
 
-/// The text of a message.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct HandoverText {
-    /// Version of the sender.
     version: String,
     /// The connections, in the order of the descriptors.
     connections: Vec<ConnectionName>,
 }
 
-/// Name of a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 enum ConnectionName {

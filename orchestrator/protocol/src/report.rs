@@ -48,6 +48,12 @@ pub enum Report {
     Checked(Box<CheckReport>),
     /// Sent once, last: the content of a recorded drive.
     Drive(DriveInfo),
+    /// Sent once, last, instead of a summary or a content: the files are separate drives, and
+    /// nothing was done.
+    Separate {
+        /// The files and directories of each drive.
+        drives: Vec<Vec<PathBuf>>,
+    },
     /// Sent once, last, instead of a summary: a journal was compared, and every decision was the
     /// same.
     Verified(Verified),
@@ -150,6 +156,9 @@ pub struct ReplaySummary {
     pub peak_rss_bytes: u64,
     /// One entry per input, in the manifest's order.
     pub topics: Vec<TopicReport>,
+    /// Each model with its runtime and provider, such as "model `det`: rten 0.24".
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub models: Vec<String>,
     /// Counts of the recorder; `clips.jsonl` has a line for each clip, including recovered ones.
     #[serde(flatten)]
     pub recording: RecordingCounts,
@@ -247,6 +256,7 @@ mod tests {
             decode_s: 0.0,
             wakes_per_s: 200.0,
             peak_rss_bytes: 1 << 20,
+            models: Vec::new(),
             topics: vec![topic],
             recording: RecordingCounts { clips: 2, in_cooldown: 3, ..RecordingCounts::default() },
             clips_replaced: 1,

@@ -136,7 +136,6 @@ impl SpoolGap {
     }
 }
 
-/// The header of a segment.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct SegmentHeader {
     pub(crate) stream: String,
@@ -187,7 +186,6 @@ impl SegmentHeader {
     }
 }
 
-/// The head of a record.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct RecordHead {
     pub(crate) len: usize,

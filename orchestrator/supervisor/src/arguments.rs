@@ -12,6 +12,7 @@ pub(crate) fn ingress(spec: &RunSpec, largest: u64, offset_ns: i64) -> Vec<OsStr
     let mut line =
         vec![format!("--clock-offset={offset_ns}").into(), format!("--largest={largest}").into()];
     line.extend(spec.drives.iter().map(|drive| option("--drive", drive)));
+    line.extend(spec.merge.then(|| "--merge".into()));
     line.extend(spec.rate.map(|rate| format!("--rate={rate}").into()));
     line.extend(spec.network.iter().cloned());
     line

@@ -13,7 +13,6 @@ use crate::supervised::SupervisedLambda;
 /// handled all samples: longer than the longest wake.
 const DRAIN_TIMEOUT: Duration = Duration::from_secs(30);
 
-/// The progress of a drive.
 pub(crate) struct DriveProgress {
     /// The files, as text.
     files: String,

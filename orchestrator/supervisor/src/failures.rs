@@ -5,14 +5,12 @@ use gleaner_base::{Exit, Failure};
 
 #[derive(Default)]
 pub(crate) struct Failures {
-    /// Reason of the last failure.
     reason: Option<String>,
     times: u32,
     /// True if a lambda faulted in one of the processes.
     faulted: bool,
     /// Exit code of the first lambda that could not start.
     not_started: Option<Exit>,
-    /// True if the drive is damaged.
     damaged: bool,
 }
 

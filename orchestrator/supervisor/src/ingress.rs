@@ -14,7 +14,6 @@ use crate::process::ChildProcess;
 use crate::service_restarts::{SILENCE, ServiceRestarts};
 use crate::{RunContext, arguments};
 
-/// The ingress of a run.
 pub(crate) struct IngressProcess {
     pub(crate) child: ChildProcess,
     pub(crate) control: IngressControl,
@@ -23,7 +22,6 @@ pub(crate) struct IngressProcess {
     pub(crate) restarts: ServiceRestarts,
     /// Set at the end of the drive.
     pub(crate) drive_ended: bool,
-    /// Set after its final status.
     has_ended: bool,
     pub(crate) status: Option<Box<IngressStatus>>,
     /// Last status of each topic that had a reader.
@@ -127,7 +125,6 @@ impl IngressProcess {
         self.child.kill();
     }
 
-    /// Returns the reason for its end.
     pub(crate) fn end_reason(&self, status: ExitStatus) -> String {
         self.restarts.reason("the ingress", status)
     }

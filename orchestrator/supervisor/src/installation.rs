@@ -12,7 +12,6 @@ pub(crate) struct Installation {
     program: Option<(PathBuf, FileId)>,
 }
 
-/// Device and number of a file.
 type FileId = (u64, u64);
 
 impl Installation {

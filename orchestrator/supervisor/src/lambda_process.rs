@@ -16,7 +16,6 @@ use crate::spec::LambdaSpec;
 const SIGKILL: i32 = Signal::KILL.as_raw();
 const SIGTERM: i32 = Signal::TERM.as_raw();
 
-/// A process of a lambda.
 pub(crate) struct LambdaProcess {
     pub(crate) child: ChildProcess,
     /// Its number in the group.
@@ -42,7 +41,6 @@ pub(crate) struct LambdaProcess {
     pub(crate) error: LastError,
 }
 
-/// The end of a process.
 pub(crate) enum ProcessEnd {
     /// On request.
     Complete(Exit),

@@ -80,7 +80,6 @@ pub fn starter() -> OsString {
 /// Interval of checks whether to stop.
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
 
-/// The unchanging context of a run.
 struct RunContext<'a> {
     spec: &'a RunSpec,
     parts: Parts,

@@ -75,7 +75,6 @@ impl ChildProcess {
         Ok(Self { name, child, handover, requested: None })
     }
 
-    /// Returns its number.
     pub(crate) fn pid(&self) -> u32 {
         self.child.id()
     }

@@ -188,7 +188,6 @@ impl<'a> ProcessGroup<'a> {
         self.counts.add(self.ingress.status, recorder);
     }
 
-    /// Starts all lambdas that are due.
     fn start_due(&mut self) -> Result<(), Failure> {
         for index in 0..self.lambdas.len() {
             if !self.lambdas[index].is_due(&self.sender, self.observer) {

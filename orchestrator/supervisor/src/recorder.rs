@@ -28,7 +28,6 @@ use crate::{RunContext, arguments};
 /// lambdas wait as long for it at their start.
 const READY: Duration = Duration::from_secs(120);
 
-/// The recorder of a run.
 pub(crate) struct RecorderProcess {
     /// `None` if it could not be started.
     process: Option<(ChildProcess, ControlClient)>,

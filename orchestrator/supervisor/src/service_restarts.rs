@@ -24,7 +24,6 @@ pub(crate) struct ServiceRestarts {
     /// Time at which the next one is to be started, as this one has ended.
     again_at: Option<Instant>,
     requested: Option<RequestedEnd>,
-    /// Time of its last report.
     reported: Instant,
     error: LastError,
 }

@@ -19,6 +19,8 @@ pub struct RunSpec {
     pub vehicle: Option<PathBuf>,
     /// Drive to play instead of joining a network.
     pub drives: Vec<PathBuf>,
+    /// True to merge separate drives by time, which are refused otherwise.
+    pub merge: bool,
     /// Speed of the drive, as a multiple of that of its recording.
     pub rate: Option<f64>,
     /// Arguments of `gleaner-ingress` that select the network.

@@ -16,11 +16,9 @@ use crate::recent_wakes::RecentWakes;
 /// Sums of the counts of all ingresses and all recorders of a run.
 #[derive(Default)]
 pub(crate) struct RunCounts {
-    /// `None` without a network.
     network: Option<NetworkStatus>,
     /// True if this is the sum of several ingresses.
     has_several_ingresses: bool,
-    /// `None` without a recorder.
     recorder: Option<Box<RecorderStatus>>,
 }
 

@@ -41,14 +41,12 @@ pub(crate) struct FileDigest {
 /// A file of a wheel that an environment gets.
 #[derive(Debug, PartialEq)]
 pub(crate) struct WheelFile {
-    /// Its number in the archive.
     index: usize,
     /// Its path in the folder of packages.
     pub(crate) path: PathBuf,
     pub(crate) digest: FileDigest,
 }
 
-/// A wheel.
 #[derive(Debug)]
 pub(crate) struct WheelArchive {
     pub(crate) name: WheelName,

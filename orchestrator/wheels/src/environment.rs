@@ -22,7 +22,6 @@ use crate::{Interpreter, WheelError, wheels_of};
 /// Name of the environment in the folder of a revision.
 pub const ENVIRONMENT: &str = "environment";
 
-/// The interpreter in an environment.
 const PYTHON: &str = "bin/python3";
 /// The file that makes a folder an environment.
 const CONFIG: &str = "pyvenv.cfg";
@@ -73,7 +72,6 @@ pub(crate) fn prepare_for(
     Ok(PreparedPython { python: path.join(PYTHON), made })
 }
 
-/// The content of an environment.
 struct WantedFiles {
     /// The paths of the wheels, with the files that they have. One is open at a time: a lambda may
     /// have more wheels than a process may have open files.

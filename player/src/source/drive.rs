@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use gleaner_base::{Exit, Explain, Failure};
-use gleaner_drives::{Replay, ReplayError};
+use gleaner_drives::{DriveOptions, Replay, ReplayError};
 use gleaner_messages::Endian;
 use gleaner_transport::{Delivery, DiscoveredTopic, Qos, SampleMeta, Sink, TopicSpec, Transport};
 
@@ -69,17 +69,12 @@ pub(crate) struct Drive {
 
 /// Receives the messages of the replay, one at a time.
 struct Inbox {
-    from_ns: i64,
     pool: Pool,
     taken: Mutex<Option<(Endian, Buffer)>>,
 }
 
 impl Sink for Inbox {
     fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Delivery {
-        // Skipped without a copy: `--start` reads through all earlier messages.
-        if meta.at_ns < self.from_ns {
-            return Delivery::Taken;
-        }
         let len = cdr.len() + cdr::ENCAPSULATION;
         let mut bytes = if len < LARGE {
             Buffer::from(Vec::with_capacity(len + 3))
@@ -97,7 +92,8 @@ impl Sink for Inbox {
 
 impl Drive {
     pub(crate) fn open(args: &Args) -> Result<Drive, Failure> {
-        let mut replay = Replay::open(&args.drives).map_err(DriveError)?;
+        let options = DriveOptions { merge: args.merge, ..DriveOptions::default() };
+        let mut replay = Replay::open_as(&args.drives, &options).map_err(DriveError)?;
         let start_ns = replay.start_ns().unwrap_or(0);
         // A truncated database does not have it.
         let known_end_ns = replay.end_ns();
@@ -114,7 +110,8 @@ impl Drive {
         } else {
             end_ns.saturating_sub(from_ns).saturating_add(GAP_NS)
         };
-        let inbox = Arc::new(Inbox { from_ns, pool: Pool::default(), taken: Mutex::new(None) });
+        begin_at(&mut replay, &args.drives, from_ns);
+        let inbox = Arc::new(Inbox { pool: Pool::default(), taken: Mutex::new(None) });
         let mut remaps = Remaps::of(args);
         let (mut topics, mut recorded) = (Vec::<PlayedTopic>::new(), Vec::new());
         for found in wanted(&replay, &args.topics)? {
@@ -170,6 +167,7 @@ impl Drive {
             return Ok(false);
         }
         self.replay = Replay::open(&self.paths).map_err(DriveError)?;
+        begin_at(&mut self.replay, &self.paths, self.window.0);
         for (spec, _) in &self.recorded {
             let sink: Arc<dyn Sink> = self.inbox.clone();
             self.replay.subscribe(spec, sink).map_err(|error| {
@@ -179,6 +177,14 @@ impl Drive {
         self.is_alive = false;
         self.rounds += 1;
         Ok(true)
+    }
+}
+
+/// Begins a replay at this time, with the latched messages that were valid then.
+fn begin_at(replay: &mut Replay, paths: &[PathBuf], from_ns: i64) {
+    if replay.start_ns().is_some_and(|start_ns| start_ns < from_ns) {
+        replay.restrict(from_ns, i64::MAX);
+        replay.begin_with_latched(paths, &DriveOptions::default());
     }
 }
 

@@ -50,7 +50,6 @@ pub struct Difference {
     pub detail: String,
 }
 
-/// The comparison of one wake.
 #[derive(Debug, Default)]
 pub(super) struct WakeComparison {
     pub(super) identical_triggers: u64,

@@ -24,7 +24,6 @@ fn faulty(ms: i64, kind: &str, message: &str) -> Value {
     wake(ms, json!([]), json!({"kind": kind, "message": message, "used": null, "allowed": null}))
 }
 
-/// Formats the differences.
 fn lines(diff: &Diff) -> Vec<String> {
     let line = |one: &Difference| {
         format!("{:?} {:?}: {}, {}", one.kind, one.change, one.label, one.detail)

@@ -18,7 +18,6 @@ use crate::format::{clip_contents, clip_span, counted, cut, grouped, seconds, si
 use crate::results::{JsonLines, ResultsError};
 use crate::run_summary::{OutputError, RunSummary, in_words, shown_config, signals};
 
-/// Maximum number of clips on a page.
 const CLIPS_MAX: usize = 1_000;
 /// Maximum number of log lines on a page.
 pub(super) const LOG_MAX: usize = 2_000;
@@ -28,7 +27,6 @@ const NOTE_CHARS: usize = 1_000;
 /// Byte budget for the texts of triggers. Faults, clips and the log have half of it each.
 const TEXT_BYTES: usize = 2 << 20;
 
-/// A line of `log.jsonl`.
 #[derive(Deserialize)]
 struct UntrustedLogLine {
     at_ns: i64,
@@ -353,12 +351,15 @@ fn facts(summary: &RunSummary) -> Vec<Fact> {
             } else {
                 String::new()
             };
-            vec![
+            let facts = [
                 fact("total run time", format!("{:.3} s{decoding}", summary.run_s)),
                 fact("replayed in", format!("{:.3} s", summary.wall_s)),
                 fact("speed", format!("{} wakes/s", grouped(summary.wakes_per_s.round() as u64))),
                 fact("peak memory", size(summary.peak_rss_bytes)),
-            ]
+            ];
+            let models = summary.models.iter().take(8);
+            let models = models.map(|model| fact("ran on", cut(&visible(model), 300)));
+            facts.into_iter().chain(models).collect()
         }
         RunSummary::Live(summary) => {
             let qos_warnings = summary.topics.iter().flat_map(|topic| &topic.qos_warnings);

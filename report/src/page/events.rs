@@ -8,7 +8,7 @@ use gleaner_lambda::{Decision, Fault, FaultKind, Trigger};
 use super::density::Density;
 use super::html;
 use super::model::{Amounts, FaultCause, FaultEvent, TriggerEvent};
-use crate::format::{cut, grouped, seconds, size};
+use crate::format::{cut, grouped, seconds, size, without_numbers};
 
 /// Maximum number of triggers with details.
 pub(super) const TRIGGERS_MAX: usize = 5_000;
@@ -180,17 +180,16 @@ impl Events {
     }
 
     fn count(&mut self, fault: &Fault, message: &str, t: f64) {
-        let cause = (fault.kind, message.to_owned());
+        let cause = (fault.kind, without_numbers(message));
         if let Some(number) = self.cause_numbers.get(&cause) {
             let cause = &mut self.causes[*number];
             cause.count += 1;
             cause.last = t;
         } else if self.causes.len() < CAUSES_MAX {
-            let (kind, message) = cause.clone();
             self.cause_numbers.insert(cause, self.causes.len());
             self.causes.push(FaultCause {
-                kind,
-                message,
+                kind: fault.kind,
+                message: message.to_owned(),
                 amounts: amounts(fault),
                 count: 1,
                 first: t,

@@ -14,7 +14,6 @@ const STYLE: [&str; 2] =
 /// uPlot, which draws the plots.
 const PLOTS: &str = include_str!("../../assets/uPlot.iife.min.js");
 const PLOTS_LICENSE: &str = include_str!("../../assets/uPlot.LICENSE");
-/// The scripts of a page of measurements.
 pub(crate) const MEASUREMENT_SCRIPTS: &[&str] = &[
     include_str!("../../assets/page/elements.js"),
     include_str!("../../assets/page/format.js"),

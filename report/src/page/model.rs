@@ -10,7 +10,6 @@ use serde::Serialize;
 use super::density::DensityBin;
 use crate::run_summary::TopicCounts;
 
-/// The results of one run.
 #[derive(Debug, Serialize)]
 pub(crate) struct PageRun {
     pub(crate) out: String,
@@ -76,7 +75,6 @@ pub(crate) struct Fact {
     pub(crate) text: String,
 }
 
-/// A trigger.
 #[derive(Debug, Serialize)]
 pub(crate) struct TriggerEvent {
     pub(crate) t: f64,
@@ -117,7 +115,7 @@ pub(crate) struct Amounts {
     pub(crate) allowed: Option<String>,
 }
 
-/// Faults with the same cause.
+/// Faults with the same cause: equal messages, but for their numbers.
 #[derive(Debug, Serialize)]
 pub(crate) struct FaultCause {
     pub(crate) kind: FaultKind,

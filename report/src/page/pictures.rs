@@ -17,7 +17,6 @@ use crate::format::{cut, seconds};
 /// Byte budget for all pictures on a page.
 const ALL_BYTES: usize = 2 << 20;
 
-/// Maximum number of thumbnails.
 const THUMBNAILS_MAX: usize = 200;
 
 /// The collected pictures.
@@ -124,7 +123,6 @@ impl<'a> Pictures<'a> {
     }
 }
 
-/// Reads the JPEG `file` of `out`.
 fn read(out: &Path, file: &Path) -> io::Result<Vec<u8>> {
     if !file.components().all(|part| matches!(part, Component::Normal(_))) {
         return Err(io::Error::other("it is outside of the result folder"));

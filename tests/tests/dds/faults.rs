@@ -91,11 +91,9 @@ fn lossy() -> Result<(), Failed> {
     Ok(())
 }
 
-fn broken_packets() -> Result<(), Failed> {
-    let mut dds = join(None)?;
-    let ports = udp_ports()?;
-    let announcement = announcement(&ports)?;
-    let receiver = TopicReceiver::new(&mut dds, MessageType::Imu, "/sensor", Qos::Auto)?;
+/// Starts a peer that publishes; returns it with both parts of its writer's id.
+fn victim(dds: &mut Dds) -> Result<(Peer, [u8; 12], Entity), Failed> {
+    let receiver = TopicReceiver::new(dds, MessageType::Imu, "/sensor", Qos::Auto)?;
     let victim = Peer::start(PeerKind::Cyclone.publisher(
         MessageType::Imu,
         "/sensor",
@@ -103,10 +101,15 @@ fn broken_packets() -> Result<(), Failed> {
     ));
     let writer =
         receiver.wait("a writer to impersonate", |samples| samples.len() >= 20)?[0].meta.writer.0;
-    let before = memory_kib()?;
+    Ok((victim, *writer.first_chunk().unwrap(), *writer.last_chunk().unwrap()))
+}
 
-    let (prefix, entity): ([u8; 12], Entity) =
-        (*writer.first_chunk().unwrap(), *writer.last_chunk().unwrap());
+fn broken_packets() -> Result<(), Failed> {
+    let mut dds = join(None)?;
+    let ports = udp_ports()?;
+    let announcement = announcement(&ports)?;
+    let (victim, prefix, entity) = victim(&mut dds)?;
+    let before = memory_kib()?;
     let mut seeds = valid_packets(prefix, entity, &MessageType::Imu.message(1).cdr());
     // The same from an unknown participant, and the announcement of a real one.
     seeds.extend(valid_packets([0x77; 12], entity, &MessageType::Imu.message(1).cdr()));
@@ -146,17 +149,8 @@ fn broken_packets() -> Result<(), Failed> {
 fn claims(size: u32) -> Result<(), Failed> {
     let mut dds = join(None)?;
     let ports = udp_ports()?;
-    let receiver = TopicReceiver::new(&mut dds, MessageType::Imu, "/sensor", Qos::Auto)?;
-    let victim = Peer::start(PeerKind::Cyclone.publisher(
-        MessageType::Imu,
-        "/sensor",
-        "--count 0 --rate 100",
-    ));
-    let writer =
-        receiver.wait("a writer to impersonate", |samples| samples.len() >= 20)?[0].meta.writer.0;
+    let (victim, prefix, entity) = victim(&mut dds)?;
     let before = memory_kib()?;
-    let (prefix, entity): ([u8; 12], Entity) =
-        (*writer.first_chunk().unwrap(), *writer.last_chunk().unwrap());
     let socket = UdpSocket::bind("127.0.0.1:0")?;
     for seq in 0..500 {
         for reader in [ANY, SPDP_READER] {

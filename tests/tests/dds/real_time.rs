@@ -7,7 +7,7 @@ use std::thread::sleep;
 use std::time::{Duration, Instant};
 
 use gleaner_tests::live::{PATIENCE, RunningProgram, descendants, run, run_all, run_by};
-use gleaner_tests::vehicle::{TestVehicle, text};
+use gleaner_tests::vehicle::TestVehicle;
 use gleaner_tests::{LambdaCopy, TempFolder, program, root};
 use gleaner_vitals::usage::ProcessUsage;
 use libtest_mimic::Failed;
@@ -126,8 +126,7 @@ fn of_a_vehicle() -> Result<(), Failed> {
     fs::write(vehicle.path("vehicle.toml"), "[network]\nreal_time = true\n").unwrap();
     vehicle.start();
     let lambda = LambdaCopy::named("tests/lambdas/ticker/rust", "ticker");
-    let deployed = vehicle.deploy(lambda.path(), &[]);
-    assert!(deployed.status.success(), "{}", text(&deployed));
+    vehicle.deploys(lambda.path());
     vehicle.until_running(&["ticker"]);
     let [ingress] = vehicle.processes("gleaner-ingress")[..] else {
         return Err("there is one ingress".into());

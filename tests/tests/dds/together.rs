@@ -114,7 +114,6 @@ struct NodeReader {
 }
 
 impl NodeReader {
-    /// Waits for `count` further samples.
     fn receive(&mut self, count: usize) -> Result<(), Failed> {
         for _ in 0..count {
             let seq = self.peer.wait("a sample", seq_of)?;
@@ -134,7 +133,6 @@ fn seq_of(event: PeerEvent) -> Option<u32> {
     if let PeerEvent::Sample { seq, .. } = event { Some(seq) } else { None }
 }
 
-/// Number of lambdas in each run.
 const LAMBDAS: usize = 10;
 
 /// Writers and readers on Cyclone DDS and Fast DDS, which read each other, while runs of several

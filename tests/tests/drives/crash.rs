@@ -14,9 +14,12 @@ use std::time::{Duration, Instant};
 use gleaner_drives::Replay;
 use gleaner_lambda::Clip;
 use gleaner_recorder::RecordingFolder as Clips;
+use gleaner_tests::random::XorShift64;
 use gleaner_tests::{LambdaCopy, TempFolder, program, root, runtime, sample_drive, times};
 use gleaner_transport::{Delivery, SampleMeta, Sink, TopicSpec, Transport};
 use libtest_mimic::{Failed, Trial};
+
+use crate::clips::needing;
 
 /// Events throughout the drive, so that clips begin and end at many times.
 const EVENTS: &str = "event_s=2,8,14,20,26,32,38";
@@ -32,12 +35,7 @@ pub fn trials() -> Vec<Trial> {
     let name = "clips_of_a_replay_killed_while_replacing_them_are_not_listed_by_the_next";
     trials.push(Trial::test(name, killed_while_replacing));
     let name = "a_full_disk_is_reported_and_leaves_nothing_broken";
-    trials.push(if can_mount() {
-        Trial::test(name, full_disk)
-    } else {
-        Trial::test(format!("{name} [cannot mount a file system]"), || Ok(()))
-            .with_ignored_flag(true)
-    });
+    trials.push(needing(name, can_mount(), |()| full_disk()));
     trials
 }
 
@@ -73,24 +71,19 @@ fn killed(store: &str) -> Result<(), Failed> {
     let kills = times("GLEANER_KILLS", 25);
     let mut seen = [0_u32; 3];
     let mut out = TempFolder::new();
-    let mut random = 0x9e37_79b9_7f4a_7c15_u64;
+    // The times differ, and are the same in each run.
+    let mut random = XorShift64(0x9e37_79b9_7f4a_7c15);
     let mut killed = 0;
     // Kills outside of the recording show nothing: continue until some hit it.
     while killed < kills || killed < 10 * kills && (seen[0] == 0 || seen[1] == 0) {
         let kill = killed;
         killed += 1;
-        // xorshift64: the times differ, and are the same in each run.
-        random ^= random << 13;
-        random ^= random >> 7;
-        random ^= random << 17;
         // Every third kill meets the state that the two before it left, so recovery is killed too.
         if kill % 3 == 0 {
             out = TempFolder::new();
         }
         let mut child = replay(lambda.path(), out.path()).spawn()?;
-        thread::sleep(Duration::from_nanos(
-            (duration.as_nanos() as u64).saturating_mul(random % 1000) / 1000,
-        ));
+        thread::sleep(duration / 1000 * random.below(1000) as u32);
         child.kill()?;
         child.wait()?;
         let with_context = |why: Failed| {
@@ -264,11 +257,12 @@ fn in_namespace(script: &str, args: &[&OsStr]) -> Command {
     unshare
 }
 
-fn can_mount() -> bool {
+fn can_mount() -> Result<(), String> {
     let folder = TempFolder::new();
     let mount =
         in_namespace("mount -t tmpfs -o size=16k tmpfs \"$1\"", &[folder.path().as_ref()]).output();
-    mount.is_ok_and(|output| output.status.success())
+    let is_mounted = mount.is_ok_and(|output| output.status.success());
+    is_mounted.then_some(()).ok_or("cannot mount a file system".to_owned())
 }
 
 fn full_disk() -> Result<(), Failed> {
@@ -282,22 +276,10 @@ fn full_disk() -> Result<(), Failed> {
             let (disk, copy) = (TempFolder::new(), TempFolder::new());
             std::fs::create_dir(copy.path().join("left"))?;
             let size = format!("{kib}k");
-            let (program, drive) = (program("gleaner-runtime"), sample_drive());
-            let mut args: Vec<&OsStr> =
-                vec![size.as_ref(), disk.path().as_ref(), copy.path().as_ref()];
-            args.extend([
-                program.as_os_str(),
-                "replay".as_ref(),
-                lambda.path().as_ref(),
-                drive.as_ref(),
-            ]);
-            args.extend([
-                "--set".as_ref(),
-                EVENTS.as_ref(),
-                "--out".as_ref(),
-                disk.path().as_os_str(),
-            ]);
-            let mut replay = in_namespace(ON_A_SMALL_DISK, &args);
+            let places = [OsStr::new(&size), disk.path().as_os_str(), copy.path().as_os_str()];
+            let mut replay = in_namespace(ON_A_SMALL_DISK, &places);
+            replay.arg(program("gleaner-runtime")).arg("replay").arg(lambda.path());
+            replay.arg(sample_drive()).args(["--set", EVENTS, "--out"]).arg(disk.path());
             let output = replay.env("XDG_CACHE_HOME", root().join("target/test-cache")).output()?;
             let stderr = std::fs::read_to_string(copy.path().join("stderr"))?;
             let with_context =
@@ -306,18 +288,14 @@ fn full_disk() -> Result<(), Failed> {
                 "0" => fits += 1,
                 "1" => {
                     full += 1;
-                    if stderr.contains("panicked")
-                        || !stderr.contains("error: cannot")
-                        || !stderr.contains("No space left")
-                    {
+                    let lacks = |texts: [&str; 2]| texts.iter().any(|text| !stderr.contains(text));
+                    let path = disk.path().to_string_lossy();
+                    if stderr.contains("panicked") || lacks(["error: cannot", "No space left"]) {
                         return Err(with_context("the error does not name the cause"));
                     }
-                    if !stderr.contains("make room")
-                        || !stderr.contains(&*disk.path().to_string_lossy())
-                    {
-                        return Err(with_context(
-                            "the error names neither the file nor the way out",
-                        ));
+                    if lacks(["make room", &*path]) {
+                        let why = "the error names neither the file nor the way out";
+                        return Err(with_context(why));
                     }
                 }
                 other => {
@@ -332,9 +310,10 @@ fn full_disk() -> Result<(), Failed> {
             // Smaller steps where most of the small writes happen.
             kib += if kib < 256 { 12 } else { kib / 8 };
         }
-        println!("{store}: {full} disks were too small, {fits} large enough");
+        let counts = format!("{store}: {full} disks were too small, {fits} large enough");
+        println!("{counts}");
         if full < 20 || fits == 0 {
-            return Err(format!("{store}: {full} disks were too small, {fits} large enough").into());
+            return Err(counts.into());
         }
     }
     Ok(())

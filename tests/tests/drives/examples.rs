@@ -4,11 +4,13 @@
 //! Drives that cannot be part of the project are in the folder that `GLEANER_SHARED` names; tests
 //! without their drive are ignored with that reason.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use gleaner_lambda::twins_differ;
 use gleaner_tests::{ReplayRun, replay, root, sample_drive, shared_file};
 use libtest_mimic::{Failed, Trial};
+
+use crate::clips::{needing, same};
 
 const KINDS: [&str; 2] = ["rust", "python"];
 
@@ -38,30 +40,30 @@ pub fn trials() -> Vec<Trial> {
     }
     trials.push(Trial::test("every_function_returns_the_same_to_both_twins", all_results));
     for kind in KINDS {
-        trials.push(shared(
-            format!("brake_dark_in_{kind}_finds_both_brakings_at_night"),
-            "rec_brake_dark.mcap",
+        trials.push(needing(
+            &format!("brake_dark_in_{kind}_finds_both_brakings_at_night"),
+            shared_file("rec_brake_dark.mcap"),
             move |drive| at(&drive, "examples/brake-dark", kind, &[15.84, 30.25]),
         ));
-        trials.push(shared(
-            format!("hello_in_{kind}_finds_six_of_six_brakings"),
-            "rec_brake_imu_trip17.mcap",
+        trials.push(needing(
+            &format!("hello_in_{kind}_finds_six_of_six_brakings"),
+            shared_file("rec_brake_imu_trip17.mcap"),
             move |drive| within_truth(&drive, kind),
         ));
-        trials.push(shared(
-            format!("pixels_in_{kind}_sees_the_recorded_pixels"),
-            "rec_raw_image_bgr8_320x180.mcap",
+        trials.push(needing(
+            &format!("pixels_in_{kind}_sees_the_recorded_pixels"),
+            shared_file("rec_raw_image_bgr8_320x180.mcap"),
             move |drive| pixels(&drive, kind),
         ));
     }
-    trials.push(shared(
-        "yolo_detector_finds_people_and_its_twins_agree".to_owned(),
-        "rec_objects_5hz.mcap",
+    trials.push(needing(
+        "yolo_detector_finds_people_and_its_twins_agree",
+        shared_file("rec_objects_5hz.mcap"),
         |drive| people(&drive),
     ));
-    trials.push(shared(
-        "the_twins_of_imu_fft_agree_on_a_walk".to_owned(),
-        "rec_sync_gopro_walk.mcap",
+    trials.push(needing(
+        "the_twins_of_imu_fft_agree_on_a_walk",
+        shared_file("rec_sync_gopro_walk.mcap"),
         |drive| {
             twins(
                 "examples/imu-fft",
@@ -70,25 +72,12 @@ pub fn trials() -> Vec<Trial> {
             )
         },
     ));
-    trials.push(shared(
-        "the_twins_of_pixels_agree".to_owned(),
-        "rec_raw_image_bgr8_320x180.mcap",
+    trials.push(needing(
+        "the_twins_of_pixels_agree",
+        shared_file("rec_raw_image_bgr8_320x180.mcap"),
         |drive| twins("tests/lambdas/pixels", &drive, &["--all"]),
     ));
     trials
-}
-
-/// A test on a file that is not part of the project; ignored, with the reason in its name, if the
-/// file is missing.
-fn shared(
-    name: String,
-    file: &str,
-    test: impl FnOnce(PathBuf) -> Result<(), Failed> + Send + 'static,
-) -> Trial {
-    match shared_file(file) {
-        Ok(path) => Trial::test(name, move || test(path)),
-        Err(reason) => Trial::test(format!("{name} [{reason}]"), || Ok(())).with_ignored_flag(true),
-    }
 }
 
 fn run(lambda: &str, kind: &str, drive: &Path, args: &[&str]) -> Result<ReplayRun, Failed> {
@@ -219,12 +208,4 @@ fn pixels(drive: &Path, kind: &str) -> Result<(), Failed> {
 
 fn truth(drive: &Path) -> Result<serde_json::Value, Failed> {
     Ok(serde_json::from_str(&std::fs::read_to_string(drive.with_extension("truth.json"))?)?)
-}
-
-fn same<T: PartialEq + std::fmt::Debug>(found: &T, expected: &T) -> Result<(), Failed> {
-    if found == expected {
-        Ok(())
-    } else {
-        Err(format!("found {found:?}, expected {expected:?}").into())
-    }
 }

@@ -42,7 +42,6 @@ const HELP: &str = "`cargo tree --target all -e all -i NAME@VERSION` prints the 
                     a version. Choose a version of that package which uses the version of the \
                     others: `cargo update -p PACKAGE --precise VERSION`, or `Cargo.toml`.";
 
-/// Versions of each package.
 fn versions() -> BTreeMap<String, Vec<String>> {
     let file = files().into_iter().find(|file| file.path == "Cargo.lock").expect("it is there");
     let lock: toml::Table = file.text.parse().expect("it is TOML");

@@ -28,7 +28,6 @@ struct Kills {
     lambda: usize,
 }
 
-/// Sums over all runs.
 #[derive(Debug, Default)]
 struct ChaosCounts {
     kills: BTreeMap<&'static str, usize>,

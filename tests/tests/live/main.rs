@@ -101,7 +101,6 @@ fn with_long_deadline(lambda: &str) -> LambdaCopy {
 /// A trigger: its label, and the sequence number of the sample of the camera or IMU that caused it.
 type TriggerKey = (String, Option<u64>);
 
-/// The triggers of decisions.
 fn trigger_keys(decisions: &[Decision]) -> Vec<TriggerKey> {
     let of = |decision: &Decision| {
         let seq = decision.seq;

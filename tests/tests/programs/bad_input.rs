@@ -1,8 +1,6 @@
 //! Mistakes of users and the messages about them: a message names the object, the cause and the
 //! way out, and the exit code gives scripts the kind of mistake.
 
-use std::path::PathBuf;
-
 use gleaner_lambda::FaultKind;
 use gleaner_tests::drive::{COMPRESSED, IMAGE, compressed, corrupted, image, one_topic, truncated};
 use gleaner_tests::{
@@ -18,7 +16,7 @@ fn hello(change: impl Fn(String) -> String, args: &[&str]) -> ReplayRun {
     replay(LambdaCopy::of("examples/hello/rust", change).path(), &[sample_drive()], args)
 }
 
-fn replaced(from: &'static str, to: &'static str) -> impl Fn(String) -> String {
+fn replaced(from: &str, to: &str) -> impl Fn(String) -> String {
     move |manifest| {
         assert!(manifest.contains(from), "the manifest has no {from}");
         manifest.replace(from, to)
@@ -36,44 +34,68 @@ fn assert_message(run: &ReplayRun, parts: &[&str]) {
 }
 
 #[test]
-fn an_unknown_key_is_named_with_its_line_and_the_nearest_one() {
-    let run = hello(replaced("depth = 512", "dept = 512"), &[]);
-    assert_message(
-        run.must_exit(USAGE),
-        &[
-            "error: ",
-            "lambda.toml, line 16: unknown key `dept` in [[input]]",
-            "help:  did you mean `depth`?",
-        ],
-    );
+fn a_mistake_in_the_manifest_is_named_with_its_place_and_the_way_out() {
+    let cases: [(&str, &str, &[&str]); 4] = [
+        (
+            "depth = 512",
+            "dept = 512",
+            &[
+                "error: ",
+                "lambda.toml, line 16: unknown key `dept` in [[input]]",
+                "help:  did you mean `depth`?",
+            ],
+        ),
+        (
+            "depth = 512",
+            "depth = 0",
+            &[
+                "line 16: `input.depth` is 0, below the minimum of 1",
+                "help:  give a value from 1 to 65536",
+            ],
+        ),
+        (
+            "topic = \"/imu/data\"",
+            "topic = \"/imu/dta\"",
+            &[
+                "error: cannot start lambda `hello`",
+                "cause: cannot subscribe input `imu`",
+                "no topic `/imu/dta` (did you mean `/imu/data`?)",
+                "/vehicle/speed",
+                "help:",
+                "--remap FROM:=TO",
+            ],
+        ),
+        (
+            "type = \"sensor_msgs/msg/Imu\"",
+            "type = \"sensor_msgs/msg/NavSatFix\"",
+            &[
+                "topic `/imu/data` has type `sensor_msgs/msg/Imu`, not `sensor_msgs/msg/NavSatFix`",
+                "help:",
+                "type = \"sensor_msgs/msg/Imu\"",
+            ],
+        ),
+    ];
+    for (from, to, parts) in cases {
+        assert_message(hello(replaced(from, to), &[]).must_exit(USAGE), parts);
+    }
 }
 
 #[test]
-fn depth_zero_is_refused_with_its_bounds() {
-    let run = hello(replaced("depth = 512", "depth = 0"), &[]);
-    assert_message(
-        run.must_exit(USAGE),
-        &[
-            "line 16: `input.depth` is 0, below the minimum of 1",
-            "help:  give a value from 1 to 65536",
-        ],
-    );
-}
-
-#[test]
-fn a_missing_topic_is_named_with_the_nearest_and_with_remap() {
-    let run = hello(replaced("topic = \"/imu/data\"", "topic = \"/imu/dta\""), &[]);
-    assert_message(
-        run.must_exit(USAGE),
-        &[
-            "error: cannot start lambda `hello`",
-            "cause: cannot subscribe input `imu`",
-            "no topic `/imu/dta` (did you mean `/imu/data`?)",
-            "/vehicle/speed",
-            "help:",
-            "--remap FROM:=TO",
-        ],
-    );
+fn a_mistake_in_the_arguments_is_named_with_what_fits() {
+    let cases: [([&str; 2], &[&str]); 3] = [
+        (
+            ["--remap", "/imu:=/imu/data"],
+            &["no input has the topic `/imu` of --remap", "`/imu/data`"],
+        ),
+        (
+            ["--set", "brake_mps=-1.4"],
+            &["lambda `hello` has no config value `brake_mps`", "brake_mps2"],
+        ),
+        (["--set", "brake_mps2=hard"], &["`brake_mps2`", "`hard`", "a number"]),
+    ];
+    for (args, parts) in cases {
+        assert_message(hello(|manifest| manifest, &args).must_exit(USAGE), parts);
+    }
 }
 
 #[test]
@@ -84,46 +106,6 @@ fn remap_finds_a_topic_of_another_name() {
     );
     assert_eq!(run.must_exit(0).labels(), ["hard-brake"; 3]);
     assert_eq!(run.decisions[0].topic.as_deref(), Some("/car/imu"));
-}
-
-#[test]
-fn a_remap_of_an_unknown_topic_is_refused() {
-    let run = hello(|manifest| manifest, &["--remap", "/imu:=/imu/data"]);
-    assert_message(
-        run.must_exit(USAGE),
-        &["no input has the topic `/imu` of --remap", "`/imu/data`"],
-    );
-}
-
-#[test]
-fn a_wrong_type_is_named_with_the_one_found() {
-    let run = hello(
-        replaced("type = \"sensor_msgs/msg/Imu\"", "type = \"sensor_msgs/msg/NavSatFix\""),
-        &[],
-    );
-    assert_message(
-        run.must_exit(USAGE),
-        &[
-            "topic `/imu/data` has type `sensor_msgs/msg/Imu`, not `sensor_msgs/msg/NavSatFix`",
-            "help:",
-            "type = \"sensor_msgs/msg/Imu\"",
-        ],
-    );
-}
-
-#[test]
-fn set_of_an_unknown_key_names_the_nearest() {
-    let run = hello(|manifest| manifest, &["--set", "brake_mps=-1.4"]);
-    assert_message(
-        run.must_exit(USAGE),
-        &["lambda `hello` has no config value `brake_mps`", "brake_mps2"],
-    );
-}
-
-#[test]
-fn set_of_a_wrong_type_names_the_right_type() {
-    let run = hello(|manifest| manifest, &["--set", "brake_mps2=hard"]);
-    assert_message(run.must_exit(USAGE), &["`brake_mps2`", "`hard`", "a number"]);
 }
 
 #[test]
@@ -294,21 +276,16 @@ fn the_log_of_a_failed_init_is_shown() {
 }
 
 #[test]
-fn an_exception_in_an_event_has_its_traceback_in_the_decision() {
-    let run = misbehave("python", "error");
-    let (kind, message) = run.must_exit(FAULTED).first_fault().expect("a fault");
-    assert_eq!(kind, FaultKind::Exception);
-    assert!(message.contains("main.py") && message.contains("in on_event"), "{message}");
-    assert_continued(&run);
-}
-
-#[test]
-fn an_exit_in_python_code_is_a_fault_and_does_not_end_the_replay() {
-    let run = misbehave("python", "exit");
-    let (kind, message) = run.must_exit(FAULTED).first_fault().expect("a fault");
-    assert_eq!(kind, FaultKind::Exception);
-    assert!(message.contains("SystemExit"), "{message}");
-    assert_continued(&run);
+fn an_exception_or_exit_in_an_event_is_a_fault_with_its_traceback_and_does_not_end_the_replay() {
+    for (behaviour, parts) in
+        [("error", &["main.py", "in on_event"][..]), ("exit", &["SystemExit"])]
+    {
+        let run = misbehave("python", behaviour);
+        let (kind, message) = run.must_exit(FAULTED).first_fault().expect("a fault");
+        assert_eq!(kind, FaultKind::Exception);
+        assert!(parts.iter().all(|part| message.contains(part)), "{message}");
+        assert_continued(&run);
+    }
 }
 
 /// Asserts that every wake faulted and has its decision, with back-off between them.
@@ -348,49 +325,26 @@ fn pixels_of(message: Vec<u8>) -> [ReplayRun; 2] {
         IMAGE,
         &[(1, message)],
     );
-    pixels_over(&[drive])
-}
-
-fn pixels_over(drives: &[PathBuf]) -> [ReplayRun; 2] {
-    ["rust", "python"]
-        .map(|kind| replay(&root().join("tests/lambdas/pixels").join(kind), drives, &[]))
+    let lambdas = ["rust", "python"].map(|kind| root().join("tests/lambdas/pixels").join(kind));
+    lambdas.map(|lambda| replay(&lambda, std::slice::from_ref(&drive), &[]))
 }
 
 #[test]
-fn an_image_with_too_few_bytes_for_its_size_is_refused_with_the_numbers() {
-    for run in pixels_of(image(4000, 3000, "rgb8", 12000, &[0; 100])) {
-        let (_, message) = run.must_exit(FAULTED).first_fault().expect("a fault");
-        assert!(message.contains("4000x3000") && message.contains("it has 100"), "{message}");
-    }
-}
-
-#[test]
-fn an_image_whose_rows_overlap_is_refused_with_the_numbers() {
-    for run in pixels_of(image(10, 2, "bgr8", 29, &[0; 100])) {
-        let (_, message) = run.must_exit(FAULTED).first_fault().expect("a fault");
-        assert!(message.contains("has a step of 29 bytes; a row needs 30"), "{message}");
-    }
-}
-
-#[test]
-fn an_image_of_no_size_or_unknown_encoding_is_refused() {
-    for run in pixels_of(image(0, 10, "mono8", 0, &[])) {
-        assert!(run.first_fault().expect("a fault").1.contains("image size is 0x10"));
-    }
-    for run in pixels_of(image(1, 1, "rgb565", 2, &[0; 2])) {
-        assert!(
-            run.first_fault().expect("a fault").1.contains("encoding `rgb565` is not supported")
-        );
-    }
-}
-
-#[test]
-fn a_truncated_message_is_malformed_and_does_not_end_the_replay() {
+fn an_image_that_contradicts_itself_is_refused_with_the_numbers_and_does_not_end_the_replay() {
     let mut cut = image(10, 10, "mono8", 10, &[0; 100]);
     cut.truncate(40);
-    for run in pixels_of(cut) {
-        let message = run.must_exit(FAULTED).first_fault().expect("a fault").1;
-        assert!(message.contains("contradicts its type `sensor_msgs/msg/Image`"), "{message}");
+    let cases: [(Vec<u8>, &[&str]); 5] = [
+        (image(4000, 3000, "rgb8", 12000, &[0; 100]), &["4000x3000", "it has 100"]),
+        (image(10, 2, "bgr8", 29, &[0; 100]), &["has a step of 29 bytes; a row needs 30"]),
+        (image(0, 10, "mono8", 0, &[]), &["image size is 0x10"]),
+        (image(1, 1, "rgb565", 2, &[0; 2]), &["encoding `rgb565` is not supported"]),
+        (cut, &["contradicts its type `sensor_msgs/msg/Image`"]),
+    ];
+    for (message, parts) in cases {
+        for run in pixels_of(message) {
+            let (_, fault) = run.must_exit(FAULTED).first_fault().expect("a fault");
+            assert!(parts.iter().all(|part| fault.contains(part)), "{fault}");
+        }
     }
 }
 
@@ -424,16 +378,7 @@ fn a_jpeg_bomb_is_refused_before_memory_is_touched() {
 
 #[test]
 fn a_sample_larger_than_max_size_is_counted_and_reported() {
-    let folder = TempFolder::new();
-    let message = image(1000, 1000, "rgb8", 3000, &vec![7; 3_000_000]);
-    let drive = one_topic(
-        &folder,
-        "/camera/front/image_raw",
-        "sensor_msgs/msg/Image",
-        IMAGE,
-        &[(1, message)],
-    );
-    for run in pixels_over(&[drive]) {
+    for run in pixels_of(image(1000, 1000, "rgb8", 3000, &vec![7; 3_000_000])) {
         let summary = run.must_exit(0).summary.as_ref().expect("a summary");
         assert_eq!(
             (summary.wakes, summary.topics[0].too_big, summary.topics[0].received),
@@ -441,6 +386,14 @@ fn a_sample_larger_than_max_size_is_counted_and_reported() {
         );
         assert_message(&run, &["samples dropped: larger than max_size", "camera", "1048576"]);
     }
+}
+
+#[test]
+fn a_default_max_size_for_small_pictures_is_warned_of() {
+    let change = replaced("max_size = \"2 MiB\"\n", "");
+    let lambda = LambdaCopy::of("examples/brake-dark/rust", change);
+    let run = replay(lambda.path(), &[sample_drive()], &["--no-record"]);
+    assert_message(&run, &["max_size is large for the samples", "camera", "ring_mib=56"]);
 }
 
 #[test]

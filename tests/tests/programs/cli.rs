@@ -37,6 +37,15 @@ fn hello() -> PathBuf {
 }
 
 #[test]
+fn variables_of_ros_2_that_gleaner_ignores_are_named() {
+    let mut doctor = Command::new(program("gleaner"));
+    doctor.arg("doctor").env("RMW_IMPLEMENTATION", "rmw_zenoh_cpp").env("ROS_STATIC_PEERS", "");
+    let output = doctor.output().expect("the program starts");
+    let found = String::from_utf8_lossy(&output.stdout);
+    assert!(found.contains("middleware: DDS with multicast; ignored: RMW_"), "{found}");
+}
+
+#[test]
 fn json_is_the_summary_of_the_replay() {
     let (out, drive) = (TempFolder::new(), sample_drive());
     let car = LambdaCopy::of("examples/hello/rust", |manifest| {

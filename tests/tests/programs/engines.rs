@@ -68,7 +68,6 @@ impl Orin {
         stderr
     }
 
-    /// Returns the entries with engines.
     fn engines(&self) -> Vec<PathBuf> {
         let entries = fs::read_dir(self.home.path().join("cache/gleaner")).into_iter().flatten();
         let paths = entries.map(|entry| entry.unwrap().path());

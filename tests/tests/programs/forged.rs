@@ -174,7 +174,6 @@ fn statements() -> Vec<Forgery> {
     ]
 }
 
-/// Changed messages.
 fn messages() -> Vec<Forgery> {
     let camera = &["gleaner.topic", CAMERA];
     let checksum = &["gleaner.topic", CAMERA, "checksum"];
@@ -254,7 +253,6 @@ fn messages() -> Vec<Forgery> {
     ]
 }
 
-/// Changed channels and definitions.
 fn channels() -> Vec<Forgery> {
     vec![
         forgery(

@@ -16,11 +16,10 @@ const USAGE: i32 = 2;
 const TIMEOUT_S: &str = "120";
 
 const MANIFEST: &str = "lambda = { name = 'x', version = '0.1.0', kind = 'python', \
-                        entry = 'main.py' }\nschedule.period = '1s'\n\
+                        entry = 'main.py', files = ['data'] }\nschedule.period = '1s'\n\
                         [[model]]\nname = 'm'\nfile = 'm.onnx'\nsha256 = \
                         '0000000000000000000000000000000000000000000000000000000000000000'\n";
 
-/// Kind of a hostile file.
 #[derive(Clone, Copy, Debug)]
 enum HostileFile {
     /// A link to a file outside of the lambda.
@@ -34,6 +33,8 @@ enum HostileFile {
     Sparse,
 }
 
+use HostileFile::{Device, Link, LinkToFolder, Pipe, Sparse};
+
 /// A lambda in Python, and files outside of it.
 struct TestLambda {
     all: TempFolder,
@@ -46,6 +47,7 @@ impl TestLambda {
         all.write("lambda/lambda.toml", MANIFEST);
         all.write("lambda/main.py", "def on_tick(ctx):\n    pass\n");
         all.write("lambda/m.onnx", "");
+        all.write("lambda/data/a", "1");
         Self { all }
     }
 
@@ -69,14 +71,14 @@ impl TestLambda {
             format!("it is a link to `{}`, outside of `", target.display())
         };
         let why = match kind {
-            HostileFile::Link => leads_to(&secret.join("a/msg/X.msg")),
-            HostileFile::LinkToFolder => leads_to(&secret),
-            HostileFile::Device => leads_to(Path::new("/dev/zero")),
-            HostileFile::Pipe => {
+            Link => leads_to(&secret.join("a/msg/X.msg")),
+            LinkToFolder => leads_to(&secret),
+            Device => leads_to(Path::new("/dev/zero")),
+            Pipe => {
                 assert!(Command::new("mkfifo").arg(&path).status().unwrap().success());
                 "it is not a regular file".to_owned()
             }
-            HostileFile::Sparse => {
+            Sparse => {
                 File::create(&path).unwrap().set_len(1 << 40).unwrap();
                 String::new()
             }
@@ -121,24 +123,18 @@ impl TestLambda {
 #[test]
 fn a_build_names_and_refuses_hostile_files_and_leaves_nothing() {
     for (name, kind) in [
-        ("lambda.toml", HostileFile::Link),
-        ("lambda.toml", HostileFile::Device),
-        ("lambda.toml", HostileFile::Pipe),
-        ("lambda.toml", HostileFile::Sparse),
-        ("main.py", HostileFile::Link),
-        ("main.py", HostileFile::Device),
-        ("main.py", HostileFile::Pipe),
-        ("main.py", HostileFile::Sparse),
-        ("part/of.py", HostileFile::Link),
-        ("part/of.py", HostileFile::Sparse),
-        ("m.onnx", HostileFile::Link),
-        ("m.onnx", HostileFile::Device),
-        ("m.onnx", HostileFile::Pipe),
-        ("m.onnx", HostileFile::Sparse),
-        ("msg/a/msg/X.msg", HostileFile::Link),
-        ("msg/a/msg/X.msg", HostileFile::Sparse),
-        ("msg", HostileFile::LinkToFolder),
-    ] {
+        ("lambda.toml", &[Link, Device, Pipe, Sparse][..]),
+        ("main.py", &[Link, Device, Pipe, Sparse]),
+        ("part/of.py", &[Link, Sparse]),
+        ("m.onnx", &[Link, Device, Pipe, Sparse]),
+        ("data/a", &[Link, Sparse]),
+        ("data/b", &[LinkToFolder, Pipe]),
+        ("msg/a/msg/X.msg", &[Link, Sparse]),
+        ("msg", &[LinkToFolder]),
+    ]
+    .into_iter()
+    .flat_map(|(name, kinds)| kinds.iter().map(move |kind| (name, *kind)))
+    {
         let lambda = TestLambda::new();
         // The state after a killed build.
         lambda.all.write("lambda/.build.partial/half.py", "");
@@ -179,17 +175,13 @@ fn many_sparse_files_do_not_fill_the_disk() {
 #[test]
 fn every_command_names_and_refuses_hostile_files_of_a_build() {
     for (name, kind) in [
-        ("build/lambda.toml", HostileFile::Link),
-        ("build/lambda.toml", HostileFile::Pipe),
-        ("build/lambda.toml", HostileFile::Sparse),
-        ("build/main.py", HostileFile::Link),
-        ("build/main.py", HostileFile::Device),
-        ("build/main.py", HostileFile::Pipe),
-        ("build/main.py", HostileFile::Sparse),
-        ("build/more/notes", HostileFile::Link),
-        ("build/more/notes", HostileFile::Pipe),
-        ("build/more/notes", HostileFile::Sparse),
-    ] {
+        ("build/lambda.toml", &[Link, Pipe, Sparse][..]),
+        ("build/main.py", &[Link, Device, Pipe, Sparse]),
+        ("build/more/notes", &[Link, Pipe, Sparse]),
+    ]
+    .into_iter()
+    .flat_map(|(name, kinds)| kinds.iter().map(move |kind| (name, *kind)))
+    {
         let lambda = TestLambda::built();
         let wanted = lambda.spoil(name, kind);
         let journal = lambda.all.path().join("journal");
@@ -212,7 +204,7 @@ fn an_environment_with_a_hostile_description_is_refused() {
     let python = Parts::find().and_then(|parts| parts.python(None)).expect("Python is installed");
     fs::create_dir_all(lambda.path(".venv/bin")).unwrap();
     symlink(python, lambda.path(".venv/bin/python3")).unwrap();
-    for kind in [HostileFile::Pipe, HostileFile::Device, HostileFile::Link, HostileFile::Sparse] {
+    for kind in [Pipe, Device, Link, Sparse] {
         let wanted = lambda.spoil(".venv/pyvenv.cfg", kind);
         lambda.refuses(&["replay"], &wanted);
         lambda.refuses(&["check"], &wanted);
@@ -223,7 +215,7 @@ fn an_environment_with_a_hostile_description_is_refused() {
 fn an_update_refuses_a_hostile_manifest() {
     let lambda = TestLambda::new();
     fs::create_dir(lambda.path(".gleaner")).unwrap();
-    for kind in [HostileFile::Pipe, HostileFile::Device, HostileFile::Link, HostileFile::Sparse] {
+    for kind in [Pipe, Device, Link, Sparse] {
         let wanted = lambda.spoil("lambda.toml", kind);
         lambda.refuses(&["new", "--update"], &wanted);
     }

@@ -5,6 +5,7 @@ use std::ffi::OsStr;
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
+use gleaner_tests::readers::compare_clips;
 use gleaner_tests::{
     LambdaCopy, ReplayRun, TempFolder, Verification, replay_to, root, sample_drive, verify,
 };
@@ -292,6 +293,7 @@ fn a_clip_verifies_its_decisions_and_counts_those_it_cannot() {
         for example in ["hello", "brake-dark"] {
             let lambda = root().join("examples").join(example).join(kind);
             let journaled = journaled(&lambda, &sample_drive(), &BRAKING);
+            compare_clips(journaled.out.path(), &[sample_drive()]);
             assert!(!journaled.run.clips.is_empty());
             for clip in &journaled.run.clips {
                 let again = verify_clip(&lambda, &journaled.out.path().join(&clip.file));

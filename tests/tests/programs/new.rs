@@ -7,7 +7,6 @@ use std::process::Command;
 use gleaner_protocol::ReplaySummary;
 use gleaner_tests::{TempFolder, program, root, sample_drive};
 
-/// Creates a new lambda.
 fn new(folder: &TempFolder, kind: &str) -> PathBuf {
     let lambda = folder.path().join("pot-hole");
     must_succeed(gleaner(folder.path()).args(["new", "pot-hole", "--kind", kind]));
@@ -92,6 +91,22 @@ fn a_sandboxed_build_produces_the_same_component() {
     assert!(component().expect("a component") == plain, "{stderr}");
 }
 
+/// Returns a folder with the manifests of a lambda in Rust, without its code.
+fn small_crate() -> TempFolder {
+    let folder = TempFolder::new();
+    folder.write(
+        "lambda.toml",
+        "lambda = { name = 'x', version = '0.1.0', kind = 'wasm', entry = 'x.wasm' }\n\
+         schedule.period = '1s'\n",
+    );
+    folder.write(
+        "Cargo.toml",
+        "[package]\nname = 'x'\nversion = '0.1.0'\nedition = '2024'\n\
+         [lib]\ncrate-type = ['cdylib']\n[workspace]\n",
+    );
+    folder
+}
+
 /// Actions that a build script attempts; it prints the name of each and the outcome.
 const TRIES: &str = r#"
 fn outcome<T, E>(tried: Result<T, E>) -> &'static str {
@@ -117,20 +132,10 @@ fn main() {
 
 #[test]
 fn a_sandboxed_build_script_has_no_access_outside_of_its_build() {
-    let (folder, outside) = (TempFolder::new(), TempFolder::new());
+    let (folder, outside) = (small_crate(), TempFolder::new());
     outside.write("canary", "canary");
     let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let port = listener.local_addr().unwrap().port().to_string();
-    folder.write(
-        "lambda.toml",
-        "lambda = { name = 'x', version = '0.1.0', kind = 'wasm', entry = 'x.wasm' }\n\
-         schedule.period = '1s'\n",
-    );
-    folder.write(
-        "Cargo.toml",
-        "[package]\nname = 'x'\nversion = '0.1.0'\nedition = '2024'\n\
-         [lib]\ncrate-type = ['cdylib']\n[workspace]\n",
-    );
     folder.write("src/lib.rs", "#[unsafe(no_mangle)]\npub extern \"C\" fn x() {}\n");
     let tries = TRIES.replace("OUTSIDE", outside.path().to_str().unwrap()).replace("PORT", &port);
     folder.write("build.rs", tries.as_bytes());
@@ -173,18 +178,8 @@ fn a_sandboxed_build_script_has_no_access_outside_of_its_build() {
 
 #[test]
 fn a_failed_sandboxed_build_names_the_permissions_of_its_code() {
-    let (folder, outside) = (TempFolder::new(), TempFolder::new());
+    let (folder, outside) = (small_crate(), TempFolder::new());
     let canary = outside.write("canary", "canary");
-    folder.write(
-        "lambda.toml",
-        "lambda = { name = 'x', version = '0.1.0', kind = 'wasm', entry = 'x.wasm' }\n\
-         schedule.period = '1s'\n",
-    );
-    folder.write(
-        "Cargo.toml",
-        "[package]\nname = 'x'\nversion = '0.1.0'\nedition = '2024'\n\
-         [lib]\ncrate-type = ['cdylib']\n[workspace]\n",
-    );
     // A component can include a file even without a build script.
     folder.write(
         "src/lib.rs",

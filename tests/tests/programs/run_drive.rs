@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use gleaner_protocol::{LiveStatus, Report};
 use gleaner_tests::live::{RunningProgram, decisions, descendants, run_all, signal, summary};
+use gleaner_tests::readers::compare_clips;
 use gleaner_tests::{LambdaCopy, TempFolder, replay, root, sample_drive};
 
 /// Exit code for a manifest or a drive that cannot be used.
@@ -106,6 +107,7 @@ fn a_drive_is_decided_as_in_its_replay_and_its_clips_are_recorded() {
     assert_eq!((imu.received, imu.no_slot, imu.lost.unwrap_or(0)), (IMU, 0, 0), "{recorder:?}");
     let clips = std::fs::read_to_string(out.path().join("clips.jsonl")).unwrap();
     assert_eq!(clips.lines().count() as u64, recorder.recording.clips, "{clips}");
+    compare_clips(out.path(), &[sample_drive()]);
 }
 
 #[test]

@@ -4,6 +4,7 @@
 use std::path::Path;
 
 use gleaner_tests::live::{decisions, run_all, summary};
+use gleaner_tests::readers::compare_clips;
 use gleaner_tests::{LambdaCopy, TempFolder, sample_drive, verify_clip};
 
 /// IMU samples of the sample drive.
@@ -47,6 +48,7 @@ fn beside_garbage_on_a_control_page_others_see_each_sample_and_their_clips_prove
     let finished = started.finish();
     let begun = decisions(&out.path().join("attack"));
     assert!(begun.iter().any(|it| !it.triggers.is_empty()), "no attack: {}", finished.stderr);
+    compare_clips(out.path(), &[sample_drive()]);
     for (name, lambda) in [("first", &honest[0]), ("second", &honest[1])] {
         let live = summary(&out.path().join(name));
         let imu = &live.topics[0];

@@ -7,6 +7,7 @@ use std::process::{Command, Output};
 use gleaner_base::grouped;
 use gleaner_lambda::Clip;
 use gleaner_tests::live::{run_all, summary};
+use gleaner_tests::readers::compare_clips;
 use gleaner_tests::{LambdaCopy, TempFolder, gleaner, replay_to, sample_drive};
 use serde_json::Value;
 
@@ -55,6 +56,7 @@ fn a_signed_clip_is_verified_by_its_vehicle_and_refused_once_it_is_changed() {
     assert!(finished.status.success(), "{}", finished.stderr);
     let recording = summary(out.path()).recording.unwrap().recording;
     assert!(recording.clips > 0 && recording.unsigned == 0, "{}", finished.stderr);
+    compare_clips(out.path(), &[sample_drive()]);
     let clip = &clips(out.path())[0];
     let path = out.path().join(&clip.file);
 

@@ -116,7 +116,7 @@ fn a_pattern_without_readable_topics_is_refused_with_those_that_are() {
     drop(writer);
     let drives = [sample_drive(), folder.write("notes.mcap", file.into_inner())];
     for pattern in ["/notes", "/no*"] {
-        let run = braking(&drives, &["--topics", pattern]);
+        let run = braking(&drives, &["--merge", "--topics", pattern]);
         let stderr = &run.must_exit(USAGE).stderr;
         assert!(
             stderr.contains(&format!(
@@ -130,7 +130,7 @@ fn a_pattern_without_readable_topics_is_refused_with_those_that_are() {
             "{stderr}"
         );
     }
-    let all = braking(&drives, &["--topics", "*"]);
+    let all = braking(&drives, &["--merge", "--topics", "*"]);
     assert_eq!(all.must_exit(0).clips[0].topics.len(), 3);
     assert!(all.stderr.contains("clips are made without this topic"), "{}", all.stderr);
 }

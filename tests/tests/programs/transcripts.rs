@@ -33,7 +33,6 @@ fn assert_transcripts(page: &str, folder: &TempFolder) {
     }
 }
 
-/// A temporary folder with the sample drive.
 fn with_drive() -> TempFolder {
     let folder = TempFolder::new();
     symlink(sample_drive(), folder.path().join("highway_drive.mcap"))

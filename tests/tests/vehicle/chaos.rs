@@ -12,7 +12,7 @@ use std::time::{Duration, Instant, SystemTime};
 use gleaner_protocol::vehicle_api::{StreamLine, VehicleStatus};
 use gleaner_tests::live::{no_player, play, signal};
 use gleaner_tests::random::XorShift64;
-use gleaner_tests::vehicle::{TestVehicle, text};
+use gleaner_tests::vehicle::TestVehicle;
 use gleaner_tests::{LambdaCopy, times};
 
 use super::{clips, recording, ticker};
@@ -39,8 +39,7 @@ pub fn killed_at_random() {
     let since_1970 = SystemTime::UNIX_EPOCH.elapsed().expect("the clock is set");
     let mut random = XorShift64(since_1970.as_nanos() as u64 | 1);
     println!("random numbers from {}", random.0);
-    let mut vehicle = TestVehicle::new();
-    vehicle.start();
+    let mut vehicle = TestVehicle::started();
     let lambdas = [
         recording("rust", "first"),
         ticker("rust", "second"),
@@ -48,8 +47,7 @@ pub fn killed_at_random() {
         detector(),
     ];
     for lambda in &lambdas {
-        let deployed = vehicle.deploy(lambda.path(), &[]);
-        assert!(deployed.status.success(), "{}", text(&deployed));
+        vehicle.deploys(lambda.path());
     }
     // Without it, clips hold journals only.
     if let Some(why) = no_player() {

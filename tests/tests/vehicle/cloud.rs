@@ -39,7 +39,6 @@ fn deploy(
     cloud.gleaner(&[&["deploy", folder, "--fleet", "--key", &key], args].concat())
 }
 
-/// Returns the phase of a lambda.
 fn phase(vehicle: &TestVehicle, id: &str) -> Option<LambdaPhase> {
     let deployments = vehicle.try_status()?.deployments;
     let deployment = deployments.into_iter().find(|it| it.id == id)?;
@@ -93,8 +92,7 @@ pub fn follows() {
     });
     vehicle.until_running(&["ticks"]);
     let local = ticker("rust", "local");
-    let deployed = vehicle.deploy(local.path(), &[]);
-    assert!(deployed.status.success(), "{}", text(&deployed));
+    vehicle.deploys(local.path());
     cloud.succeeds(&["remove", "ticks", "--fleet"]);
     vehicle.until("the removal", |vehicle| {
         let ids = vehicle.status().deployments.into_iter().map(|it| it.id);
@@ -107,8 +105,7 @@ pub fn follows() {
 pub fn clips() {
     let (mut cloud, mut vehicle) = enrolled();
     let lambda = recording("rust", "ticks");
-    let deployed = vehicle.deploy(lambda.path(), &[]);
-    assert!(deployed.status.success(), "{}", text(&deployed));
+    vehicle.deploys(lambda.path());
     vehicle.until("two clips", |vehicle| (super::clips(vehicle).len() > 1).then_some(()));
     // Both sides are killed while clips are announced.
     cloud.kill();

@@ -22,12 +22,10 @@ pub fn outlive() {
     let own = std::process::id().to_string();
     let limited = Command::new("prlimit").args(["--pid", &own, "--nofile=256:"]).status();
     assert!(limited.expect("util-linux has `prlimit`").success());
-    let mut vehicle = TestVehicle::new();
-    vehicle.start();
+    let mut vehicle = TestVehicle::started();
     let lambdas = [ticker("rust", "first"), ticker("python", "second")];
     for lambda in &lambdas {
-        let deployed = vehicle.deploy(lambda.path(), &[]);
-        assert!(deployed.status.success(), "{}", text(&deployed));
+        vehicle.deploys(lambda.path());
     }
     let names = ["gleaner-ingress", "gleaner-shim", "gleaner-runtime", "start.py"];
     let processes = |vehicle: &TestVehicle| names.map(|name| vehicle.processes(name));
@@ -85,8 +83,7 @@ pub fn upgraded() {
     std::fs::copy(program("gleaner-supervisor"), &supervisor).expect("a copy");
     vehicle.start();
     let lambda = ticker("rust", "first");
-    let deployed = vehicle.deploy(lambda.path(), &[]);
-    assert!(deployed.status.success(), "{}", text(&deployed));
+    vehicle.deploys(lambda.path());
     let before = (vehicle.supervisor(), vehicle.processes("gleaner-ingress"));
     // As a package manager does it.
     let new = home.join("new");
@@ -106,8 +103,7 @@ pub fn upgraded() {
 }
 
 pub fn reaped() {
-    let mut vehicle = TestVehicle::new();
-    vehicle.start();
+    let vehicle = TestVehicle::started();
     let supervisor = vehicle.supervisor();
     vehicle.reload();
     vehicle.until("its connection", |vehicle| vehicle.try_status()?.supervisor.map(|_| ()));
@@ -123,8 +119,7 @@ pub fn reaped() {
 }
 
 pub fn stopped() {
-    let mut vehicle = TestVehicle::new();
-    vehicle.start();
+    let mut vehicle = TestVehicle::started();
     let lambda = ticker("rust", "ticker");
     vehicle.deploy(lambda.path(), &[]);
     vehicle.succeeds(&["stop", "ticker"]);
@@ -143,8 +138,7 @@ pub fn stopped() {
 }
 
 pub fn removed() {
-    let mut vehicle = TestVehicle::new();
-    vehicle.start();
+    let mut vehicle = TestVehicle::started();
     let [lambda, other] = ["ticker", "other"].map(|name| ticker("rust", name));
     for (lambda, args) in [(&lambda, &["--release", "7"][..]), (&other, &[])] {
         let deployed = vehicle.deploy(lambda.path(), args);
@@ -185,13 +179,11 @@ const FAILING: &str = "def on_tick(self, ctx):\n\
 const HARMLESS: &str = "def on_tick(self, ctx):\n    pass";
 
 pub fn fallback() {
-    let mut vehicle = TestVehicle::new();
-    vehicle.start();
+    let mut vehicle = TestVehicle::started();
     let lambda = PythonLambda::new("guard", HARMLESS);
     let other = ticker("rust", "other");
     for path in [lambda.path(), other.path()] {
-        let deployed = vehicle.deploy(path, &[]);
-        assert!(deployed.status.success(), "{}", text(&deployed));
+        vehicle.deploys(path);
     }
     lambda.write("guard", "0.2.0", FAILING);
     vehicle.deploy(lambda.path(), &[]);
@@ -228,8 +220,7 @@ pub fn fallback() {
 }
 
 pub fn quarantined() {
-    let mut vehicle = TestVehicle::new();
-    vehicle.start();
+    let vehicle = TestVehicle::started();
     let other = ticker("rust", "other");
     vehicle.deploy(other.path(), &[]);
     let failing =
@@ -262,8 +253,7 @@ pub fn quarantined() {
 }
 
 pub fn killed_by_itself() {
-    let mut vehicle = TestVehicle::new();
-    vehicle.start();
+    let vehicle = TestVehicle::started();
     let code = "def __init__(self, ctx):\n\
                 \u{20}   import os, threading\n\
                 \u{20}   threading.Timer(0.25, os.kill, (os.getpid(), 9)).start()\n\
@@ -282,8 +272,7 @@ pub fn killed_by_itself() {
 }
 
 pub fn at_once() {
-    let mut vehicle = TestVehicle::new();
-    vehicle.start();
+    let vehicle = TestVehicle::started();
     // The ids are also names of streams of the daemon itself.
     let names = ["first", "second", "events", "orchestrator"];
     let lambdas = names.map(|name| PythonLambda::new(name, HARMLESS));

@@ -16,8 +16,7 @@ const FAULTY: &str = "wakes = 0\n\
                       \u{20}       raise ValueError('no')";
 
 pub fn probation() {
-    let mut vehicle = TestVehicle::new();
-    vehicle.start();
+    let mut vehicle = TestVehicle::started();
     let lambda = PythonLambda::new("guard", HARMLESS);
     vehicle.deploy(lambda.path(), &[]);
     lambda.write("guard", "0.2.0", FAULTY);
@@ -49,8 +48,7 @@ pub fn proven() {
     // The first wakes are none with a fault, until it is proven.
     let late = FAULTY.replace("if Lambda", "if Lambda.wakes > 15 and Lambda");
     lambda.write("guard", "0.2.0", &late);
-    let deployed = vehicle.deploy(lambda.path(), &[]);
-    assert!(deployed.status.success(), "{}", text(&deployed));
+    vehicle.deploys(lambda.path());
     vehicle.until("its probation", |vehicle| vehicle.deployment("guard").is_proven.then_some(()));
     let shown = vehicle.until("a warning", |vehicle| {
         let shown = text(&vehicle.gleaner(&["status"]));

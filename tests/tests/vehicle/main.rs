@@ -19,7 +19,6 @@ use gleaner_tests::vehicle::TestVehicle;
 use gleaner_tests::{LambdaCopy, TempFolder, namespace};
 use libtest_mimic::{Arguments, Trial};
 
-/// A case, and its name.
 type Case = (&'static str, fn());
 
 const CASES: [Case; 28] = [
@@ -100,7 +99,6 @@ fn recording(language: &str, name: &str) -> LambdaCopy {
     })
 }
 
-/// Returns the listed clips.
 fn clips(vehicle: &TestVehicle) -> Vec<Clip> {
     let text = std::fs::read_to_string(vehicle.path("state/clips/clips.jsonl"));
     let text = text.unwrap_or_default();
@@ -140,7 +138,6 @@ impl PythonLambda {
         }
     }
 
-    /// Adds tables to its manifest.
     fn add(&self, tables: &str) {
         for place in ["", "build/"] {
             let path = self.path().join(format!("{place}lambda.toml"));

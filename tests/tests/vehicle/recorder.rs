@@ -6,7 +6,7 @@ use std::path::Path;
 
 use gleaner_protocol::supervision::{EventKind, LambdaStatus, SupervisorStatus};
 use gleaner_tests::program;
-use gleaner_tests::vehicle::{TestVehicle, text};
+use gleaner_tests::vehicle::TestVehicle;
 
 use super::{clips, events, recording, ticker};
 
@@ -22,8 +22,7 @@ pub fn missing() {
     vehicle.start();
     let lambdas = [ticker("rust", "second"), recording("rust", "first")];
     for lambda in &lambdas {
-        let deployed = vehicle.deploy(lambda.path(), &[]);
-        assert!(deployed.status.success(), "{}", text(&deployed));
+        vehicle.deploys(lambda.path());
     }
     // It decides, and the status has both reasons.
     let (_, lambda) = until(&vehicle, "the wakes without a recorder", |supervisor, lambda| {

@@ -41,8 +41,7 @@ pub fn signatures() {
 }
 
 pub fn changed_file() {
-    let mut vehicle = TestVehicle::new();
-    vehicle.start();
+    let mut vehicle = TestVehicle::started();
     let lambda = ticker("python", "ticker");
     vehicle.deploy(lambda.path(), &[]);
     let revision = files(&vehicle.path("state/revisions")).remove(0);
@@ -73,11 +72,9 @@ pub fn changed_file() {
 }
 
 pub fn lost_state() {
-    let mut vehicle = TestVehicle::new();
-    vehicle.start();
+    let mut vehicle = TestVehicle::started();
     let lambda = ticker("rust", "ticker");
-    let deployed = vehicle.deploy(lambda.path(), &[]);
-    assert!(deployed.status.success(), "{}", text(&deployed));
+    vehicle.deploys(lambda.path());
     vehicle.stop();
     let copies = ["state/state.json", "state/state.json.copy"].map(|name| vehicle.path(name));
     let backup = fs::read(&copies[0]).expect("it is durable");
@@ -96,11 +93,9 @@ pub fn lost_state() {
 }
 
 pub fn retried() {
-    let mut vehicle = TestVehicle::new();
-    vehicle.start();
+    let mut vehicle = TestVehicle::started();
     let lambda = ticker("rust", "ticker");
-    let deployed = vehicle.deploy(lambda.path(), &[]);
-    assert!(deployed.status.success(), "{}", text(&deployed));
+    vehicle.deploys(lambda.path());
     vehicle.stop();
     // In place of a disk that fails, or a machine without memory or open files.
     let revision = files(&vehicle.path("state/revisions")).remove(0);
@@ -120,8 +115,7 @@ pub fn memory() {
         .expect("the folder can be written");
     vehicle.start();
     let [first, second] = ["first", "second"].map(|name| ticker("python", name));
-    let deployed = vehicle.deploy(first.path(), &[]);
-    assert!(deployed.status.success(), "{}", text(&deployed));
+    vehicle.deploys(first.path());
     let refused = text(&vehicle.deploy(second.path(), &[]));
     assert!(refused.contains("there is no memory for deployment `second`"), "{refused}");
     let numbers =
@@ -129,8 +123,7 @@ pub fn memory() {
     assert!(refused.contains(numbers), "{refused}");
     // One that is stopped takes none.
     vehicle.succeeds(&["stop", "first"]);
-    let deployed = vehicle.deploy(second.path(), &[]);
-    assert!(deployed.status.success(), "{}", text(&deployed));
+    vehicle.deploys(second.path());
     let refused = text(&vehicle.gleaner(&["start", "first"]));
     assert!(refused.contains("there is no memory for deployment `first`"), "{refused}");
     // What was admitted runs, also if the vehicle has less later.
@@ -150,11 +143,9 @@ pub fn memory() {
 }
 
 pub fn cpu() {
-    let mut vehicle = TestVehicle::new();
-    vehicle.start();
+    let vehicle = TestVehicle::started();
     let other = ticker("rust", "other");
-    let deployed = vehicle.deploy(other.path(), &[]);
-    assert!(deployed.status.success(), "{}", text(&deployed));
+    vehicle.deploys(other.path());
     let greedy = PythonLambda::new("greedy", "def on_tick(self, ctx):\n    pass");
     greedy.add("[demand]\ncpu = \"1min\"\n");
     let refused = text(&vehicle.deploy(greedy.path(), &[]));

@@ -16,10 +16,8 @@ use super::ticker;
 
 /// A vehicle whose lambda `first` has reported.
 fn vehicle() -> TestVehicle {
-    let mut vehicle = TestVehicle::new();
-    vehicle.start();
-    let deployed = vehicle.deploy(ticker("rust", "first").path(), &[]);
-    assert!(deployed.status.success(), "{}", text(&deployed));
+    let vehicle = TestVehicle::started();
+    vehicle.deploys(ticker("rust", "first").path());
     vehicle.until("a report", |vehicle| vehicle.deployment("first").status?.live);
     vehicle
 }

@@ -35,9 +35,13 @@ with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
 print(hashlib.sha256(open(path, "rb").read()).hexdigest())
 "#;
 
-/// A lambda that reports the number of the package `answer`, ten times a second.
-const CODE: &str = "import answer\n\n\nclass Lambda:\n    def __init__(self, ctx):\n        pass\n\n\
-                    \u{20}   def on_tick(self, ctx):\n        ctx.event('answer', answer.ANSWER)\n";
+/// A lambda that reports the number of the package `answer`, ten times a second, times that of a
+/// data file.
+const CODE: &str = "import answer\nfrom pathlib import Path\n\n\nclass Lambda:\n    \
+                    def __init__(self, ctx):\n        \
+                    self.unit = float((Path(__file__).parent / 'data/unit').read_text())\n\n    \
+                    def on_tick(self, ctx):\n        \
+                    ctx.event('answer', answer.ANSWER * self.unit)\n";
 
 /// The folder of that lambda, and of its wheels.
 struct LambdaWithWheels {
@@ -49,9 +53,11 @@ impl LambdaWithWheels {
     fn new(version: &str) -> Self {
         let folder = TempFolder::new();
         folder.write("lambda/main.py", CODE);
+        folder.write("lambda/data/unit", "1");
         let manifest = format!(
             "[lambda]\nname = \"answers\"\nversion = \"{version}\"\nkind = \"python\"\n\
-             entry = \"main.py\"\n[schedule]\nperiod = \"100ms\"\n[limits]\ndeadline = \"5s\"\n"
+             entry = \"main.py\"\nfiles = [\"data\"]\n\
+             [schedule]\nperiod = \"100ms\"\n[limits]\ndeadline = \"5s\"\n"
         );
         folder.write("lambda/lambda.toml", manifest);
         folder.write("wheels/README", "");
@@ -110,10 +116,8 @@ pub fn runs() {
     fs::remove_dir_all(lambda.folder.path().join("wheels")).expect("our folder");
     let built = lambda.build(&[]);
     assert!(built.contains("exit status: 0"), "{built}");
-    let mut vehicle = TestVehicle::new();
-    vehicle.start();
-    let deployed = vehicle.deploy(&lambda.path(), &[]);
-    assert!(deployed.status.success(), "{}", text(&deployed));
+    let mut vehicle = TestVehicle::started();
+    vehicle.deploys(&lambda.path());
     vehicle.until("a decision", |vehicle| scores(vehicle).contains(&42.0).then_some(()));
 
     let revisions = vehicle.path("state/revisions");
@@ -145,13 +149,11 @@ pub fn runs() {
 }
 
 pub fn refused() {
-    let mut vehicle = TestVehicle::new();
-    vehicle.start();
+    let vehicle = TestVehicle::started();
     let mut lambda = LambdaWithWheels::new("0.1.0");
     lambda.lock("answer-1.0-py3-none-any.whl", "answer.py", "ANSWER = 42.0\n");
     lambda.build(&[]);
-    let deployed = vehicle.deploy(&lambda.path(), &[]);
-    assert!(deployed.status.success(), "{}", text(&deployed));
+    vehicle.deploys(&lambda.path());
 
     let mut other = LambdaWithWheels::new("0.2.0");
     other.lock("answer-2.0-cp39-none-any.whl", "answer.py", "ANSWER = 43.0\n");

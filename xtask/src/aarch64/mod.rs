@@ -26,7 +26,6 @@ use cases::{CASES, Machine, ReplayCase};
 use tools::Emulator;
 pub(crate) use tools::{TARGET, Tools};
 
-/// The programs that are run.
 const PROGRAMS: [&str; 4] = ["gleaner", "gleaner-compile", "gleaner-inference", "gleaner-runtime"];
 const SHIM: &str = "gleaner-shim";
 

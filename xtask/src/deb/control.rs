@@ -15,7 +15,6 @@ use crate::steps;
 /// Scripts that dpkg runs.
 const SCRIPTS: [&str; 3] = ["postinst", "prerm", "postrm"];
 
-/// The commit that is packaged.
 pub(crate) struct PackagedCommit {
     /// Version of all packages of it.
     pub(crate) version: String,

@@ -95,7 +95,6 @@ pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, F
 
 /// Steps for each package.
 const STEPS: usize = 3;
-/// Steps of [`packages`].
 pub(crate) const ALL_STEPS: usize = PACKAGES.len() * STEPS;
 
 /// Builds all packages from the programs in a folder, and returns their files.

@@ -32,7 +32,6 @@ ExecStart=/bin/sh -c 'exec /test/booted @ARGUMENTS@ >/test/log 2>&1'
 TimeoutStartSec=10min
 ";
 
-/// Runs the test.
 pub(super) fn test(
     checkout: &Checkout,
     package: &Path,

@@ -76,7 +76,6 @@ const CLOUD: PackageSource = PackageSource {
     exposure_max: 13,
 };
 
-/// All packages.
 pub(super) const PACKAGES: [PackageSource; 2] = [VEHICLE, CLOUD];
 
 impl PackageSource {
@@ -85,7 +84,6 @@ impl PackageSource {
         format!("usr/share/doc/{}", self.name)
     }
 
-    /// Returns the name of its unit.
     pub(super) fn unit(&self) -> String {
         format!("{}.service", self.name)
     }

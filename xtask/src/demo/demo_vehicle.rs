@@ -22,7 +22,6 @@ use crate::steps;
 /// Folder of everything that the demo leaves, relative to the checkout.
 pub(super) const OUT: &str = "out/demo/vehicle";
 
-/// Name of the vehicle.
 pub(super) const NAME: &str = "demo-car";
 
 /// The configuration of the vehicle. Two cores are just enough for all examples in both languages.
@@ -74,7 +73,7 @@ impl<'c> DemoVehicle<'c> {
             ["root", "publisher", "deployer"].map(|key| file(&format!("{key}.pem")));
         let keys = ["--root", &root, "--publisher", &publisher, "--deployer", &deployer];
         vehicle.gleaner(&[&["trust", "new", &trust], &keys[..]].concat())?;
-        let mut orchestrator = checkout.command(checkout.program("gleaner-orchestrator"));
+        let mut orchestrator = checkout.with_models("gleaner-orchestrator");
         orchestrator.arg("--state").arg(out.join("state")).arg("--run").arg(&vehicle.run);
         orchestrator.arg("--vehicle").arg(out.join("vehicle.toml"));
         orchestrator.stdin(Stdio::null()).stdout(Stdio::null()).stderr(log);
@@ -110,7 +109,6 @@ impl<'c> DemoVehicle<'c> {
         steps::run(&mut self.command(arguments), &see_log())
     }
 
-    /// Returns the status, if the orchestrator answers.
     fn status(&self) -> Option<VehicleStatus> {
         let output = self.command(&["status", "--json"]).stdin(Stdio::null()).output().ok()?;
         serde_json::from_slice(&output.stdout).ok()

@@ -14,7 +14,8 @@ use crate::examples::{DRIVE, Example, TwinReplay, difference};
 pub(super) fn run(checkout: &Checkout, examples: &[&Example]) -> Result<bool, Failure> {
     let mut rows =
         vec![["example", "kind", "wakes", "wakes/s", "peak MiB", "triggers"].map(str::to_owned)];
-    let (mut verdicts, mut verifications, mut clips) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut verdicts, mut verifications) = (Vec::new(), Vec::new());
+    let (mut models, mut clips) = (Vec::new(), Vec::new());
     let mut agree = true;
     for example in examples {
         let twins = example.replay(checkout)?;
@@ -22,6 +23,7 @@ pub(super) fn run(checkout: &Checkout, examples: &[&Example]) -> Result<bool, Fa
         for twin in &twins {
             verifications.push(verify(checkout, example, twin)?);
         }
+        models.extend(twins[0].summary.models.iter().map(|model| visible(model)));
         clips.extend(twins.first().into_iter().flat_map(clip_lines));
         let difference = difference(&twins);
         agree &= difference.is_none();
@@ -42,7 +44,7 @@ pub(super) fn run(checkout: &Checkout, examples: &[&Example]) -> Result<bool, Fa
         });
     }
     println!("\n{}", table(&rows));
-    for verdict in verdicts {
+    for verdict in models.into_iter().chain(verdicts) {
         println!("{verdict}");
     }
     println!("\nclips of the Rust lambdas:");

@@ -21,10 +21,10 @@ use crate::checkout::Checkout;
 use crate::examples::{DRIVE, EXAMPLES, Example};
 use crate::setup;
 use crate::steps::Steps;
+use crate::venv;
 
 pub(crate) use vehicle_run::{COMMAND as VEHICLE_COMMAND, run as run_vehicle};
 
-/// Choices of the command.
 struct DemoOptions {
     /// The page of the cloud is open until Ctrl-C.
     stays_open: bool,
@@ -63,6 +63,10 @@ pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, F
     steps.begin("programs of a vehicle");
     setup::vehicle_programs(checkout)?;
     steps.begin(&format!("replay of {DRIVE} with a model"));
+    let package = [("onnxruntime", "onnxruntime")];
+    if let Err(failure) = venv::apart(checkout, &checkout.onnxruntime(), &package) {
+        println!("{failure}\nmodels run on rten instead of ONNX Runtime");
+    }
     let agree = drive::run(checkout, &with_models)? && others_agree;
     drive::print_files(checkout);
     if options.has_cloud {

@@ -218,7 +218,6 @@ fn kill(vehicle: &DemoVehicle) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Formats the counts of each lambda.
 fn counts(status: &VehicleStatus) -> String {
     let head = ["lambda", "state", "wakes", "faults", "triggers", "restarts"].map(str::to_owned);
     let row = |deployment: &DeploymentStatus| {

@@ -22,7 +22,6 @@ use services::{find, missing};
 
 const USAGE: &str = "`cargo xtask fleet` takes --install, --kills N, --vehicles N and --every S";
 
-/// Choices of the command.
 struct FleetOptions {
     is_installing: bool,
     /// Number of programs to kill; without any, the cloud runs until ctrl-C.

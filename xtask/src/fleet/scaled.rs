@@ -21,7 +21,6 @@ use crate::steps::output;
 
 /// User of PostgreSQL if root runs this: it refuses to run as root.
 const NOBODY: u32 = 65534;
-/// Number of replicas.
 const REPLICAS: usize = 3;
 /// Credentials of the object store, which is on this machine and checks none.
 const KEY: &str = "fleet";
@@ -55,7 +54,6 @@ impl Drop for FleetFolder {
 }
 
 impl ScaledCloud {
-    /// Starts everything.
     pub(super) fn start(checkout: &Checkout) -> Result<Self, Failure> {
         let failed = |error: io::Error| {
             Failure::caused_by(Exit::Internal, "cannot prepare the folder of the fleet", &error)

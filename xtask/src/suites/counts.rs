@@ -2,7 +2,6 @@
 
 use std::path::Path;
 
-/// Counts of the tests in a suite.
 #[derive(Debug, Default)]
 pub(super) struct TestCounts {
     pub(super) passed: u64,
@@ -31,7 +30,6 @@ impl TestCounts {
         }
     }
 
-    /// Adds the counts of `suite`.
     pub(super) fn add(&mut self, counts: TestCounts, suite: &str) {
         let of_suite = |name: String| format!("{suite}: {name}");
         self.passed += counts.passed;

@@ -50,7 +50,6 @@ enum SuiteAction {
     Skip(&'static str),
 }
 
-/// The results of a suite.
 enum SuiteResults {
     /// Lines of Rust test programs.
     Libtest,
@@ -60,7 +59,6 @@ enum SuiteResults {
     Status,
 }
 
-/// A suite that has ended.
 struct EndedSuite {
     name: String,
     counts: TestCounts,
@@ -281,17 +279,8 @@ fn suites(checkout: &Checkout) -> Result<Vec<Suite>, Failure> {
 fn pytest(checkout: &Checkout, name: &str, folders: &[&str]) -> Suite {
     let results = checkout.target().join(format!("pytest/{name}.xml"));
     let mut pytest = checkout.command(checkout.python());
-    pytest.args([
-        "-m",
-        "pytest",
-        "-q",
-        "-p",
-        "no:cacheprovider",
-        "-p",
-        "no:logging",
-        "--junit-xml",
-    ]);
     pytest
+        .args("-m pytest -q -p no:cacheprovider -p no:logging --junit-xml".split(' '))
         .arg(&results)
         .args(folders)
         .env("GLEANER_EXTENSION", checkout.program("lib_gleaner.so"))

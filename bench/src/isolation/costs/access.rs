@@ -91,7 +91,6 @@ fn group(
     }
 }
 
-/// Repeated work, native or in a component.
 struct TimedWork<'a> {
     at: usize,
     name: &'static str,
@@ -100,7 +99,6 @@ struct TimedWork<'a> {
 }
 
 impl<'a> TimedWork<'a> {
-    /// Work that is repeated here.
     fn looped(at: usize, name: &'static str, repeated: u64, mut once: impl FnMut() + 'a) -> Self {
         Self { at, name, repeated, run: Box::new(move || (0..repeated).for_each(|_| once())) }
     }

@@ -79,7 +79,6 @@ fn attacker(twin: Twin, attack: &str, name: &str, changes: &[(&str, &str)]) -> L
     })
 }
 
-/// Returns the decisions of a replay.
 fn replayed(quick: bool, twin: Twin, attack: &str) -> Vec<Decision> {
     let lambda = attacker(twin, attack, "attack", &[]);
     let seconds = if quick { "1" } else { "12" };

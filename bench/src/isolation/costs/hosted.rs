@@ -9,7 +9,6 @@ use gleaner_host::guest::Guest;
 use gleaner_host::guest::wasm::{Loaded, WasmGuest};
 use gleaner_host::input::open_inputs;
 use gleaner_lambda::manifest::{ConfigValue, Limits, Manifest};
-use gleaner_messages::Endian;
 use gleaner_tests::drive::{IMAGE, TopicMessages};
 use gleaner_tests::root;
 use gleaner_transport::loopback::Loopback;
@@ -53,17 +52,7 @@ impl FilledInputs {
         let mut seq = 0_u64;
         let mut publish = |topic: &str, cdr: &[u8]| {
             seq += 1;
-            let at_ns = seq.cast_signed();
-            let meta = SampleMeta {
-                at_ns,
-                publish_ns: at_ns,
-                writer: Guid::default(),
-                seq,
-                endian: Endian::Little,
-                options: [0; 2],
-                layout: 0,
-                is_latched: false,
-            };
+            let meta = SampleMeta::new(seq.cast_signed(), Guid::default(), seq);
             transport.publish(topic, &meta, cdr).expect("the sample fits");
         };
         imu.messages.iter().take(COLUMN).for_each(|(_, cdr)| publish(&imu.topic, cdr));

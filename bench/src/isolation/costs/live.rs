@@ -18,10 +18,8 @@ use crate::measure::{Twin, median, pss_mib};
 use crate::rtt::Workload;
 
 const KINDS: [Twin; 2] = [Twin::Rust, Twin::Python];
-/// The length of a run on frames.
 const FRAMES: LiveLength = LiveLength { warm_up: 5, statuses: 3 };
 
-/// The length of a run.
 #[derive(Clone, Copy)]
 struct LiveLength {
     /// Wakes before anything is read. By the IMU, 160 include some with a spectrum.
@@ -30,7 +28,6 @@ struct LiveLength {
     statuses: usize,
 }
 
-/// Measurements of one kind.
 #[derive(Default)]
 struct LiveKind {
     imu_cpu_us: Vec<f64>,

@@ -30,13 +30,11 @@ pub(super) struct NativeGuest {
     lambda: Option<NativeLambda>,
 }
 
-/// A lambda and its state between wakes.
 enum NativeLambda {
     ImuFft { imu: Arc<Topic>, vertical: Field, rough: f64, road: Box<Road> },
     BrakeDark { imu: Arc<Topic>, forward: Field, brake_mps2: f64, dark_luma: f64, last_ns: i64 },
 }
 
-/// A lambda that failed, as a fault.
 struct Failed(Fault);
 
 impl NativeGuest {

@@ -23,7 +23,6 @@ const WINDOW_S: f64 = 1.25;
 /// The part of a drive that is replayed to know what all but the wakes takes.
 const BEGIN: [&str; 2] = ["--to", "0.05"];
 
-/// A lambda and its input.
 struct RecordedWorkload {
     name: &'static str,
     drive: PathBuf,
@@ -161,7 +160,6 @@ impl RecordedWorkload {
         self.lambdas[usize::from(side.twin() == Twin::Python)].path()
     }
 
-    /// Lets all sides take turns.
     fn measure(&self, turns: usize, random: &mut u64) -> Vec<SideValues> {
         let mut values: BTreeMap<usize, SideValues> = BTreeMap::new();
         let mut expected: Option<Vec<Decision>> = None;

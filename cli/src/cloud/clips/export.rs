@@ -17,7 +17,6 @@ use crate::cloud::{client, list, show};
 /// The table, in the folder of an export. `gleaner.cloud` of the Python SDK reads it.
 pub(super) const TABLE: &str = "events.jsonl";
 
-/// Runs `gleaner clips export`.
 pub(super) fn export(args: &ExportArgs) -> Result<Exit, Failure> {
     let client = client()?;
     let (stored, others): (Vec<FleetClip>, Vec<_>) =
@@ -68,7 +67,6 @@ pub(super) fn export(args: &ExportArgs) -> Result<Exit, Failure> {
     })
 }
 
-/// Returns the row of an event.
 fn row(clip: &FleetClip, moment: &ClipMoment, file: &Path) -> Value {
     let facts = &clip.facts;
     let lambda = facts.lambdas.iter().find(|lambda| lambda.name == moment.lambda);

@@ -5,7 +5,6 @@ use std::thread;
 
 use super::*;
 
-/// Reads the head of a request.
 fn head(stream: &mut impl Read) -> String {
     let (mut request, mut byte) = (Vec::new(), [0]);
     while !request.ends_with(b"\r\n\r\n") {
@@ -51,7 +50,6 @@ fn an_answer_without_end_is_refused_with_its_socket_and_the_maximum() {
     }
 }
 
-/// A cloud that serves one request.
 struct OneAnswer(TcpListener);
 
 impl OneAnswer {

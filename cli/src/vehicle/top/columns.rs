@@ -11,7 +11,6 @@ use super::figures::{LambdaFigures, ProgramFigures, VehicleFigures};
 /// Spaces between two columns.
 pub(super) const GAP: usize = 2;
 
-/// A column.
 pub(super) struct Column {
     pub(super) head: &'static str,
     pub(super) cell: fn(&LambdaFigures) -> String,
@@ -161,7 +160,6 @@ fn count(count: Option<u64>) -> String {
     count.map_or_else(|| "-".to_owned(), grouped)
 }
 
-/// The order of the rows.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) enum RowOrder {
     #[default]
@@ -174,7 +172,6 @@ pub(super) enum RowOrder {
 }
 
 impl RowOrder {
-    /// Returns the next one.
     pub(super) fn next(self) -> Self {
         match self {
             Self::Id => Self::Cpu,
@@ -186,7 +183,6 @@ impl RowOrder {
         }
     }
 
-    /// Returns the head of its column.
     pub(super) fn head(self) -> &'static str {
         match self {
             Self::Id => "id",

@@ -32,7 +32,6 @@ const POLL_INTERVAL: Duration = Duration::from_secs(1);
 /// with that of an earlier one; if none has changed, the rate is unknown.
 const POLLS_KEPT: usize = 4;
 
-/// Runs `gleaner top`.
 pub(crate) fn top(args: &TopArgs) -> Result<Exit, Failure> {
     let client = VehicleClient::of(&args.vehicle, &args.on)?;
     if !args.once && !args.vehicle.json && !stdout().is_terminal() {

@@ -21,7 +21,6 @@ use crate::render::{isolation, table};
 /// Time without an answer from which the page shows it.
 const SILENCE: Duration = POLL_INTERVAL.saturating_mul(3);
 
-/// The page.
 #[derive(Default)]
 pub(super) struct Page {
     polls: Polls,

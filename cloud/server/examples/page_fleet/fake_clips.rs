@@ -75,7 +75,6 @@ fn image(is_damaged: bool) -> Vec<u8> {
     message.data[start..].to_vec()
 }
 
-/// Returns a recording of two topics.
 fn recording(from_ns: i64) -> Vec<u8> {
     let mut file = Cursor::new(Vec::new());
     let mut writer = mcap::WriteOptions::new().create(&mut file).unwrap();

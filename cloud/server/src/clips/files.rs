@@ -34,7 +34,6 @@ const PARTS_MAX: usize = 4;
 /// Number of locks for all files.
 const TURNS: usize = 64;
 
-/// A file of a clip.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum FileOfClip {
     /// The recording, of this length, with the SHA-256 of each part.
@@ -42,7 +41,6 @@ pub(crate) enum FileOfClip {
     Thumbnail,
 }
 
-/// All files of clips.
 #[derive(Debug)]
 pub(crate) struct ClipFiles {
     place: FilePlace,
@@ -131,12 +129,10 @@ impl ClipFiles {
         Body::from_stream(parts.try_flatten())
     }
 
-    /// Removes the recording of a clip.
     pub(crate) async fn remove_recording(&self, id: &ClipId) -> io::Result<()> {
         self.place.remove(&recording(id)).await
     }
 
-    /// Removes the thumbnail of a clip.
     pub(crate) async fn remove_thumbnail(&self, id: &ClipId) -> io::Result<()> {
         self.place.remove(&thumbnail(id)).await
     }

@@ -15,15 +15,16 @@ mod bucket;
 const BOUNDS: ClipBounds =
     ClipBounds { clips: 3, vehicle_bytes: 100, bytes: 150, unfinished: 1, unfinished_s: 0 };
 
-async fn store(folder: &TempDir) -> CloudStore {
-    let store = CloudStore::of_test(folder).await;
+async fn store() -> (TempDir, CloudStore) {
+    let folder = TempDir::new().unwrap();
+    let store = CloudStore::of_test(&folder).await;
     let policy =
         ClipPolicy { upload: UploadedClips::All, day_bytes: 1 << 40, keep_s: 0, keep_bytes: 0 };
     for vehicle in ["a", "b"] {
         store.invite_vehicle("ann", vehicle).await.unwrap();
     }
     store.set_clip_policy("ann", &policy).await.unwrap();
-    store
+    (folder, store)
 }
 
 async fn announce(store: &CloudStore, vehicle: &str, name: &str, bytes: u64) {
@@ -46,8 +47,7 @@ fn name(text: &str) -> ClipName {
 
 #[tokio::test]
 async fn files_are_bounded_for_each_vehicle_and_in_all() {
-    let folder = TempDir::new().unwrap();
-    let store = store(&folder).await;
+    let (_folder, store) = store().await;
     for (vehicle, name, bytes) in [("a", "1", 60), ("a", "2", 60), ("b", "1", 95)] {
         announce(&store, vehicle, name, bytes).await;
     }
@@ -63,8 +63,7 @@ async fn files_are_bounded_for_each_vehicle_and_in_all() {
 
 #[tokio::test]
 async fn unfinished_files_are_bounded_and_forgotten_after_a_time() {
-    let folder = TempDir::new().unwrap();
-    let store = store(&folder).await;
+    let (_folder, store) = store().await;
     for name in ["1", "2"] {
         announce(&store, "a", name, 10).await;
     }
@@ -82,8 +81,7 @@ async fn unfinished_files_are_bounded_and_forgotten_after_a_time() {
 
 #[tokio::test]
 async fn the_oldest_clips_without_files_are_forgotten_above_the_bound() {
-    let folder = TempDir::new().unwrap();
-    let store = store(&folder).await;
+    let (_folder, store) = store().await;
     announce(&store, "a", "0", 10).await;
     let stored = store.clip_progress("a", &name("0"), BOUNDS).await.unwrap();
     store.clip_part_received(&stored, (10, "d"), true).await.unwrap();
@@ -97,8 +95,7 @@ async fn the_oldest_clips_without_files_are_forgotten_above_the_bound() {
 
 #[tokio::test]
 async fn stored_clips_are_removed_by_people_and_by_age_and_size() {
-    let folder = TempDir::new().unwrap();
-    let store = store(&folder).await;
+    let (_folder, store) = store().await;
     for name in ["1", "2", "3", "4"] {
         announce(&store, "a", name, 10).await;
         if name != "4" {
@@ -144,8 +141,7 @@ async fn stored_clips_are_removed_by_people_and_by_age_and_size() {
 
 #[tokio::test]
 async fn two_processes_remove_the_oldest_clip_once_and_keep_what_the_other_one_has_stored() {
-    let folder = TempDir::new().unwrap();
-    let store = store(&folder).await;
+    let (folder, store) = store().await;
     let other = CloudStore::open(&crate::store::address(&folder).await).await.unwrap();
     for name in ["1", "2"] {
         announce(&store, "a", name, 10).await;

@@ -86,7 +86,6 @@ async fn orders(cloud: &Cloud, vehicle: &str) -> CloudResult<Json<ClipOrders>> {
     Ok(Json(cloud.store.clip_orders(vehicle, cloud.clips.bounds).await?))
 }
 
-/// Receives a thumbnail.
 async fn thumbnail(
     State(cloud): State<Arc<Cloud>>,
     Extension(vehicle): Extension<KnownVehicle>,

@@ -101,7 +101,6 @@ fn progress(deployment: &FleetDeployment) -> Markup {
     }
 }
 
-/// Renders how far the waves have come.
 fn waves_of(waves: &WaveProgress) -> Markup {
     let WaveProgress { wave, waves: all, vehicles, running, failed, reason, .. } = waves;
     let (class, state) = match waves.state {

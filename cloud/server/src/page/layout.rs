@@ -29,7 +29,6 @@ const PLACES: [(&str, &str, Role); 6] = [
     ("Audit", "/audit", Role::Admin),
 ];
 
-/// The result of a page.
 pub(super) type PageResult = Result<Response, PageError>;
 
 /// An error that is answered as a page.

@@ -53,7 +53,6 @@ pub(crate) struct PageRoute {
     /// Its method, which the handler has, too.
     #[cfg_attr(not(test), expect(dead_code, reason = "read by the test of all roles"))]
     pub(crate) method: Method,
-    /// Its path.
     pub(crate) path: &'static str,
     /// The least role; `None` if no session is needed.
     pub(crate) role: Option<Role>,

@@ -26,7 +26,6 @@ const MAGIC: &[u8] = b"\x89MCAP0\r\n";
 /// The recording in a stored clip.
 #[derive(Debug, Default, PartialEq)]
 pub(super) struct Recording {
-    /// Number of all messages.
     pub(super) messages: u64,
     /// Times of the first and the last message, in ns since 1970.
     pub(super) span: [u64; 2],

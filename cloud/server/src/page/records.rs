@@ -26,7 +26,6 @@ const READ: usize = 1000;
 /// Maximum number of clips above a time line.
 const CLIPS: PageLimit = PageLimit::of(12);
 
-/// The records of a page.
 #[derive(Debug, Clone)]
 pub(super) struct RecordSource {
     pub(super) vehicle: String,
@@ -71,12 +70,10 @@ impl RecordSource {
         }
     }
 
-    /// Renders a record.
     pub(super) fn line(&self, text: &str) -> Markup {
         line(text, self.lambda.is_none())
     }
 
-    /// Returns the path of its page.
     fn path(&self) -> String {
         let vehicle = vehicle_path(&self.vehicle);
         match &self.lambda {

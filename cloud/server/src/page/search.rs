@@ -32,7 +32,6 @@ impl SearchPart {
         !self.text.is_empty() || !self.level.is_empty()
     }
 
-    /// Renders the form.
     pub(super) fn form(&self, here: &str) -> Markup {
         let levels = ["", "trace", "debug", "info", "warn", "error"];
         html! {

@@ -8,7 +8,6 @@ use gleaner_fleet::people::{NewUser, Role};
 use hyper::service::Service;
 use hyper_util::service::TowerToHyperService;
 use serde_json::json;
-use tempfile::TempDir;
 
 use super::{PageRoute, routes};
 use crate::clients::ClientNetwork;
@@ -21,7 +20,6 @@ mod limits;
 
 const PASSWORD: &str = "correct horse battery staple";
 
-/// A browser without scripts.
 struct Browser {
     router: TowerToHyperService<Router>,
     cookie: Option<String>,
@@ -48,7 +46,6 @@ impl Browser {
         Self { router: TowerToHyperService::new(people::router(cloud)), cookie: None }
     }
 
-    /// Logs in as a new user.
     async fn of(cloud: &Arc<Cloud>, name: &str, role: Role) -> Self {
         let new = NewUser { name: name.to_owned(), role };
         let code = cloud.store.invite("console", new).await.unwrap().code;
@@ -114,8 +111,7 @@ impl Browser {
 
 #[tokio::test]
 async fn each_page_is_open_to_its_role_and_the_higher_ones_only() {
-    let folder = TempDir::new().unwrap();
-    let cloud = cloud(&folder).await;
+    let (_folder, cloud) = cloud().await;
     let mut browsers = Vec::new();
     for role in ROLES {
         browsers.push((role, Browser::of(&cloud, role.as_str(), role).await));
@@ -157,8 +153,7 @@ async fn each_page_is_open_to_its_role_and_the_higher_ones_only() {
 
 #[tokio::test]
 async fn a_form_needs_the_token_of_its_session_and_the_origin_of_the_page() {
-    let folder = TempDir::new().unwrap();
-    let cloud = cloud(&folder).await;
+    let (_folder, cloud) = cloud().await;
     let mut admin = Browser::of(&cloud, "ann", Role::Admin).await;
     let mut other = Browser::of(&cloud, "bea", Role::Admin).await;
     let page = other.get("/access").await.text;
@@ -186,8 +181,7 @@ async fn a_form_needs_the_token_of_its_session_and_the_origin_of_the_page() {
 
 #[tokio::test]
 async fn each_login_makes_a_session_and_ends_the_former_one() {
-    let folder = TempDir::new().unwrap();
-    let cloud = cloud(&folder).await;
+    let (_folder, cloud) = cloud().await;
     let mut browser = Browser::of(&cloud, "ann", Role::Viewer).await;
     let first = browser.cookie.clone();
     assert_eq!(
@@ -224,8 +218,7 @@ async fn each_login_makes_a_session_and_ends_the_former_one() {
 
 #[tokio::test]
 async fn tokens_are_shown_once_and_can_be_removed() {
-    let folder = TempDir::new().unwrap();
-    let cloud = cloud(&folder).await;
+    let (_folder, cloud) = cloud().await;
     let mut browser = Browser::of(&cloud, "ann", Role::Operator).await;
     let page = browser.get("/account").await;
     assert!(page.has("value=\"operator\"") && !page.has("value=\"deployer\""));
@@ -246,8 +239,7 @@ async fn tokens_are_shown_once_and_can_be_removed() {
 
 #[tokio::test]
 async fn passwords_cannot_be_guessed_and_a_new_one_ends_other_sessions() {
-    let folder = TempDir::new().unwrap();
-    let cloud = cloud(&folder).await;
+    let (_folder, cloud) = cloud().await;
     let mut one = Browser::of(&cloud, "ann", Role::Viewer).await;
     let mut two = Browser::of(&cloud, "ann", Role::Viewer).await;
     two.post("/account/password", &[("password", PASSWORD), ("again", PASSWORD)]).await;
@@ -264,8 +256,7 @@ async fn passwords_cannot_be_guessed_and_a_new_one_ends_other_sessions() {
 
 #[tokio::test]
 async fn the_sessions_of_a_removed_user_end_at_once() {
-    let folder = TempDir::new().unwrap();
-    let cloud = cloud(&folder).await;
+    let (_folder, cloud) = cloud().await;
     let mut admin = Browser::of(&cloud, "ann", Role::Admin).await;
     let mut user = Browser::of(&cloud, "bea", Role::Viewer).await;
     assert_eq!(user.get("/vehicles").await.status, StatusCode::OK);
@@ -311,37 +302,23 @@ async fn hostile_vehicle(cloud: &Cloud) {
     let report = json!({ "cursor": "1", "clips": [clip], "gone": [] });
     let report = serde_json::from_value(report).unwrap();
     cloud.store.announce_clips("car-1", &report, ClipBounds::DEFAULT).await.unwrap();
-    cloud
-        .store
-        .execute_with(
-            "UPDATE vehicles SET epoch = 1, arrived = 3, labels = $1, problems = $2, status = $3",
-            &[&text(json!({ bad: bad })), &text(json!([bad])), &text(status)],
-        )
-        .await;
-    cloud
-        .store
-        .execute_with(
-            "INSERT INTO streams (vehicle, stream, life, next, seq, boot, boot_ns)
-         VALUES ('car-1', 'events', 1, 1, 0, '', 0)",
-            &[],
-        )
-        .await;
+    let update =
+        "UPDATE vehicles SET epoch = 1, arrived = 3, labels = $1, problems = $2, status = $3";
+    let values = [text(json!({ bad: bad })), text(json!([bad])), text(status)];
+    cloud.store.execute_with(update, &values.each_ref().map(String::as_str)).await;
+    let stream = "INSERT INTO streams (vehicle, stream, life, next, seq, boot, boot_ns)
+                  VALUES ('car-1', 'events', 1, 1, 0, '', 0)";
+    cloud.store.execute(stream).await;
     for (stream, line) in [("lambdas/a", text(line)), ("events", text(event))] {
-        cloud
-            .store
-            .execute_with(
-                "INSERT INTO records (vehicle, stream, life, seq, mark, arrival, line, bytes)
-             VALUES ('car-1', $1, 1, 0, '', 2, $2, 1)",
-                &[stream, &line],
-            )
-            .await;
+        let record = "INSERT INTO records (vehicle, stream, life, seq, mark, arrival, line, bytes)
+                      VALUES ('car-1', $1, 1, 0, '', 2, $2, 1)";
+        cloud.store.execute_with(record, &[stream, &line]).await;
     }
 }
 
 #[tokio::test]
 async fn what_a_vehicle_sends_is_never_markup() {
-    let folder = TempDir::new().unwrap();
-    let cloud = cloud(&folder).await;
+    let (_folder, cloud) = cloud().await;
     hostile_vehicle(&cloud).await;
     let mut admin = Browser::of(&cloud, "ann", Role::Admin).await;
     let label = "/vehicles?label=%3Cscript%3E&name=%22%3E%3Cb%3E";
@@ -369,19 +346,14 @@ async fn what_a_vehicle_sends_is_never_markup() {
 
 #[tokio::test]
 async fn ten_thousand_vehicles_are_filtered_and_listed_in_parts() {
-    let folder = TempDir::new().unwrap();
-    let cloud = cloud(&folder).await;
-    cloud
-        .store
-        .execute(
-            "WITH RECURSIVE n (i) AS (SELECT 0 UNION ALL SELECT i + 1 FROM n WHERE i < 9999)
+    let (_folder, cloud) = cloud().await;
+    let all = "WITH RECURSIVE n (i) AS (SELECT 0 UNION ALL SELECT i + 1 FROM n WHERE i < 9999)
          INSERT INTO vehicles (name, epoch, seen, labels, problems, version, status)
          SELECT 'car-' || i, i % 10, 1,
          '{\"site\":\"' || CASE i % 3 WHEN 0 THEN 'berlin' ELSE 'ulm' END ||
          '\",\"x\\\"site\":\"berlin\"}',
-         CASE i % 100 WHEN 0 THEN '[\"no room\"]' ELSE '[]' END, '0.1.0', '' FROM n",
-        )
-        .await;
+         CASE i % 100 WHEN 0 THEN '[\"no room\"]' ELSE '[]' END, '0.1.0', '' FROM n";
+    cloud.store.execute(all).await;
     let mut user = Browser::of(&cloud, "ann", Role::Viewer).await;
     let begin = Instant::now();
     let first = user.get("/vehicles").await;
@@ -409,8 +381,7 @@ async fn ten_thousand_vehicles_are_filtered_and_listed_in_parts() {
 
 #[tokio::test]
 async fn the_audit_trail_and_records_are_listed_in_parts() {
-    let folder = TempDir::new().unwrap();
-    let cloud = cloud(&folder).await;
+    let (_folder, cloud) = cloud().await;
     let mut admin = Browser::of(&cloud, "ann", Role::Admin).await;
     for _ in 0..60 {
         cloud.store.invite_vehicle("console", "car-1").await.unwrap();
@@ -420,16 +391,12 @@ async fn the_audit_trail_and_records_are_listed_in_parts() {
     let older = admin.get("/audit?before=13").await;
     assert!(older.has("Entries 12 to 1") && !older.has(">Older"));
 
-    cloud
-        .store
-        .execute(
-            "WITH RECURSIVE n (i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n WHERE i < 250)
+    let all = "WITH RECURSIVE n (i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n WHERE i < 250)
          INSERT INTO records (vehicle, stream, life, seq, mark, arrival, line, bytes)
          SELECT 'car-1', 'lambdas/a', 1, i, '', i, '{\"stream\":\"a\",\"seq\":' || i ||
          ',\"time_ns\":1,\"boot_ns\":1,\"boot\":\"b\",\"kind\":\"log\",\"record\":{\"at_ns\":1,' ||
-         '\"level\":\"info\",\"message\":\"line ' || i || '.\"}}', 1 FROM n",
-        )
-        .await;
+         '\"level\":\"info\",\"message\":\"line ' || i || '.\"}}', 1 FROM n";
+    cloud.store.execute(all).await;
     cloud.store.execute("UPDATE vehicles SET arrived = 250").await;
     let page = "/vehicles/car-1/lambdas/a";
     let newest = admin.get(page).await;
@@ -457,8 +424,7 @@ async fn the_audit_trail_and_records_are_listed_in_parts() {
 
 #[tokio::test]
 async fn a_vehicle_is_enrolled_by_a_file_and_cut_off() {
-    let folder = TempDir::new().unwrap();
-    let cloud = cloud(&folder).await;
+    let (_folder, cloud) = cloud().await;
     let mut admin = Browser::of(&cloud, "ann", Role::Admin).await;
     let file = admin.post("/access/vehicles", &[("name", "car-7")]).await;
     let attached = file.headers[header::CONTENT_DISPOSITION].to_str().unwrap();

@@ -22,7 +22,6 @@ const KEY_MAX: usize = 128;
 /// Longest list of tags, in bytes.
 const TAGS_MAX: usize = 4 << 10;
 
-/// The conditions of a change.
 #[derive(Debug, Default)]
 pub(super) struct ChangeConditions {
     key: Option<RequestKey>,

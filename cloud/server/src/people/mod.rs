@@ -289,7 +289,6 @@ async fn user(
     Ok(token_user)
 }
 
-/// Returns the token of a request.
 fn bearer(headers: &HeaderMap) -> Option<&str> {
     let header = headers.get(header::AUTHORIZATION)?.to_str().ok()?;
     header.strip_prefix("Bearer ")

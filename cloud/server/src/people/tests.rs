@@ -22,11 +22,12 @@ use serde_json::{Value, json};
 
 pub(crate) const ROLES: [Role; 4] = [Role::Viewer, Role::Operator, Role::Deployer, Role::Admin];
 
-pub(crate) async fn cloud(folder: &TempDir) -> Arc<Cloud> {
+pub(crate) async fn cloud() -> (TempDir, Arc<Cloud>) {
+    let folder = TempDir::new().unwrap();
     let data = DataFolder::create(&folder.path().join("data")).unwrap();
     let clips = FilePlace::open(data.clips(), None, "").unwrap();
-    Arc::new(Cloud {
-        store: CloudStore::of_test(folder).await,
+    let cloud = Arc::new(Cloud {
+        store: CloudStore::of_test(&folder).await,
         objects: Objects::new(FilePlace::open(data.objects(), None, "").unwrap()),
         clips: Arc::new(ClipFiles::new(clips, ClipBounds::DEFAULT)),
         chunks: ChunkFiles::new(FilePlace::open(data.records(), None, "").unwrap()),
@@ -42,10 +43,10 @@ pub(crate) async fn cloud(folder: &TempDir) -> Arc<Cloud> {
         retention: Retention::DEFAULT,
         keep_records_days: 30,
         address: "127.0.0.1:8443".to_owned(),
-    })
+    });
+    (folder, cloud)
 }
 
-/// An answer of the API.
 struct ApiAnswer {
     status: StatusCode,
     headers: HeaderMap,
@@ -94,7 +95,6 @@ async fn status_of(
     send(cloud, (method, path), token, &[], "{}").await.status
 }
 
-/// Adds a user; returns the token.
 async fn token_of(cloud: &Cloud, name: &str, role: Role) -> String {
     let new = NewUser { name: name.to_owned(), role };
     let code = cloud.store.invite("console", new).await.unwrap().code;
@@ -108,8 +108,7 @@ mod ranges;
 
 #[tokio::test]
 async fn each_request_is_open_to_its_role_and_the_higher_ones_only() {
-    let folder = TempDir::new().unwrap();
-    let cloud = cloud(&folder).await;
+    let (_folder, cloud) = cloud().await;
     let mut tokens = Vec::new();
     for role in ROLES {
         tokens.push((role, token_of(&cloud, role.as_str(), role).await));
@@ -147,8 +146,7 @@ async fn each_request_is_open_to_its_role_and_the_higher_ones_only() {
 
 #[tokio::test]
 async fn a_token_for_programs_has_at_most_the_rights_of_its_user_and_makes_no_others() {
-    let folder = TempDir::new().unwrap();
-    let cloud = cloud(&folder).await;
+    let (_folder, cloud) = cloud().await;
     let invite = async |role| {
         let new = NewUser { name: "ann".to_owned(), role };
         cloud.store.invite("console", new).await.unwrap().code
@@ -218,8 +216,7 @@ async fn a_token_for_programs_has_at_most_the_rights_of_its_user_and_makes_no_ot
 
 #[tokio::test]
 async fn wrong_tokens_are_limited_and_the_user_is_removed_with_the_token() {
-    let folder = TempDir::new().unwrap();
-    let cloud = cloud(&folder).await;
+    let (_folder, cloud) = cloud().await;
     let token = token_of(&cloud, "ann", Role::Viewer).await;
     let me = async |token| status_of(&cloud, Method::GET, "/v1/me", Some(token)).await;
     assert_eq!(me(&token).await, StatusCode::OK);
@@ -235,8 +232,7 @@ async fn wrong_tokens_are_limited_and_the_user_is_removed_with_the_token() {
 
 #[tokio::test]
 async fn each_error_is_a_problem_with_its_status() {
-    let folder = TempDir::new().unwrap();
-    let cloud = cloud(&folder).await;
+    let (_folder, cloud) = cloud().await;
     let token = token_of(&cloud, "ann", Role::Admin).await;
     let long = "x".repeat(BODY_MAX + 1);
     let number = u64::from(u16::MAX) + 1;
@@ -301,8 +297,7 @@ async fn each_error_is_a_problem_with_its_status() {
 
 #[tokio::test]
 async fn a_list_has_each_entry_once_in_parts_of_any_length() {
-    let folder = TempDir::new().unwrap();
-    let cloud = cloud(&folder).await;
+    let (_folder, cloud) = cloud().await;
     let token = token_of(&cloud, "u0", Role::Admin).await;
     for number in 1..7 {
         token_of(&cloud, &format!("u{number}"), Role::Viewer).await;
@@ -334,8 +329,7 @@ async fn a_list_has_each_entry_once_in_parts_of_any_length() {
 
 #[tokio::test]
 async fn a_stream_ends_once_its_token_has_no_right_any_more() {
-    let folder = TempDir::new().unwrap();
-    let cloud = cloud(&folder).await;
+    let (_folder, cloud) = cloud().await;
     cloud.store.invite_vehicle("console", "car-7").await.unwrap();
     let login = token_of(&cloud, "ann", Role::Operator).await;
     let ann = cloud.store.user(&login).await.unwrap().unwrap().user;
@@ -361,8 +355,7 @@ async fn a_stream_ends_once_its_token_has_no_right_any_more() {
 
 #[tokio::test]
 async fn only_a_deployment_has_a_long_body() {
-    let folder = TempDir::new().unwrap();
-    let cloud = cloud(&folder).await;
+    let (_folder, cloud) = cloud().await;
     let token = token_of(&cloud, "ann", Role::Admin).await;
     for (path, length, status) in [
         ("/v1/users", SMALL_MAX, StatusCode::BAD_REQUEST),

@@ -12,7 +12,6 @@ use zstd::bulk::{compress, decompress};
 use super::search::LineFacts;
 use crate::store::{KeptLine, StoredChunk, name_in_lines};
 
-/// Level of the compression.
 const LEVEL: i32 = 3;
 /// Longest first line, and most that a line has beside its record.
 const HEAD_MAX: u64 = 4096;

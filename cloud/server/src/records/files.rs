@@ -16,7 +16,6 @@ use crate::place::{FilePlace, blocking};
 use crate::store::{KeptLine, StoredChunk};
 use crate::transfer::PIECE_TIME;
 
-/// All files of chunks.
 #[derive(Debug)]
 pub(crate) struct ChunkFiles {
     place: FilePlace,
@@ -52,7 +51,6 @@ impl ChunkFiles {
         Ok(Some(content))
     }
 
-    /// Removes a file.
     pub(super) async fn remove(&self, sha256: &str) -> io::Result<()> {
         self.place.remove(sha256).await
     }

@@ -26,8 +26,7 @@ struct Recorded {
 
 impl Recorded {
     async fn start() -> Self {
-        let folder = TempDir::new().unwrap();
-        let cloud = cloud(&folder).await;
+        let (folder, cloud) = cloud().await;
         let epoch = connected(&cloud.store, CAR).await;
         Self { folder, cloud, epoch }
     }

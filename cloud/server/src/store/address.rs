@@ -48,7 +48,6 @@ pub(crate) enum StoreAddress {
 }
 
 impl StoreAddress {
-    /// Returns the address of a file.
     pub(crate) fn file(path: &Path) -> Self {
         // A path may have the characters that end it in a URL.
         let escaped = path.display().to_string().replace('%', "%25");

@@ -37,7 +37,6 @@ struct VehicleStreams {
     count: i64,
 }
 
-/// Position and size of a stream.
 struct StoredStream {
     cursor: Cursor,
     kept: i64,
@@ -56,7 +55,6 @@ impl VehicleWrite for AppendWrite {
     }
 }
 
-/// A line to insert.
 struct NewLine<'a> {
     vehicle: &'a str,
     stream: &'a str,
@@ -65,7 +63,6 @@ struct NewLine<'a> {
     line: &'a (u64, String, String),
 }
 
-/// Vehicle and name of a stream.
 type StreamKey<'a> = (&'a str, &'a str);
 
 impl CloudStore {
@@ -224,7 +221,6 @@ impl StoreChange<'_> {
         self.make_room_where_due(&grown, &streams, &before).await
     }
 
-    /// Returns what is stored of these streams.
     async fn streams_of(&mut self, keys: &[StreamKey<'_>]) -> CloudResult<StoredStreams> {
         let mut streams = StoredStreams::default();
         for part in list_parts(keys) {

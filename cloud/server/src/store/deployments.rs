@@ -140,7 +140,6 @@ impl CloudStore {
         change.finish(1, actor, "roll back", id).await
     }
 
-    /// Removes a deployment.
     pub(crate) async fn remove_deployment(
         &self,
         author: impl Into<ChangeAuthor<'_>>,

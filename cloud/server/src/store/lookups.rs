@@ -22,14 +22,12 @@ pub(super) const WANTS: &str =
     "SELECT name, generation, digest FROM vehicles WHERE is_revoked = 0 AND name IN";
 /// The envelopes of deployments.
 pub(super) const ENVELOPES: &str = "SELECT sha256, number, envelope FROM releases WHERE sha256 IN";
-/// The envelopes of revisions.
 pub(super) const REVISIONS: &str =
     "SELECT digest, unused_since, envelope FROM revisions WHERE digest IN";
 
 /// The number and the text of a key.
 type FoundRow = (i64, String);
 
-/// A lookup that waits for its query.
 struct Lookup {
     key: String,
     reply: oneshot::Sender<CloudResult<Option<FoundRow>>>,

@@ -22,7 +22,6 @@ const VEHICLES_AT_ONCE: i64 = 100;
 pub(crate) struct VehicleFilter {
     /// The whole name; any if it is empty.
     pub(crate) only: String,
-    /// A part of the name.
     pub(crate) name: String,
     /// A label with its value; any value if that is empty.
     pub(crate) label: Option<(String, String)>,

@@ -33,7 +33,6 @@ pub(crate) struct StreamBatch {
     pub(crate) cursor: Cursor,
 }
 
-/// A part of stored records.
 #[derive(Debug, Default)]
 pub(crate) struct RecordPage {
     pub(crate) lines: Vec<String>,

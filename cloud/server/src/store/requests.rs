@@ -113,7 +113,6 @@ impl StoreChange<'_> {
 
 #[cfg(test)]
 impl super::CloudStore {
-    /// Returns the answers that are kept.
     pub(crate) async fn kept_answers(&self) -> Vec<String> {
         let rows: Result<Vec<(String,)>, crate::sqlx::Error> =
             async { Ok(rows!(&self.pool; "SELECT answer FROM request_keys")) }.await;

@@ -22,7 +22,6 @@ pub(crate) struct TokenUser {
 }
 
 impl CloudStore {
-    /// Returns the user with this token.
     pub(crate) async fn user(&self, token: &str) -> CloudResult<Option<TokenUser>> {
         let Some((name, role, token, most)) = self.user_row(SecretKind::Token, token).await? else {
             return Ok(None);

@@ -102,7 +102,6 @@ impl CloudStore {
         Ok(Some(session))
     }
 
-    /// Returns the user with this session.
     pub(crate) async fn session(&self, session: &str) -> CloudResult<Option<User>> {
         let row = self.user_row(SecretKind::Session, session).await?;
         row.map(|(name, role, ..)| user((name, role))).transpose()

@@ -197,7 +197,6 @@ pub(super) use vehicle_columns;
 pub(super) type VehicleRow =
     (String, i64, i64, i64, String, String, i64, i64, String, i64, i64, i64);
 
-/// Returns the summary of a vehicle.
 pub(super) fn summary(row: VehicleRow) -> VehicleSummary {
     let (name, is_revoked, epoch, seen, version, labels, wanted, handled, problems, ..) = row;
     VehicleSummary {
@@ -242,7 +241,6 @@ pub(super) fn unknown(name: &str) -> CloudError {
     CloudError::missing(message, "`gleaner vehicles` lists all")
 }
 
-/// Returns a value as JSON.
 pub(super) fn json(value: &impl serde::Serialize) -> String {
     serde_json::to_string(value).unwrap_or_default()
 }

@@ -152,7 +152,6 @@ impl StoreChange<'_> {
 }
 
 impl FleetWishes {
-    /// Loads the releases.
     async fn load(tx: &mut sqlx::Transaction<'static, sqlx::Any>) -> CloudResult<Self> {
         type Row = (String, i64, String, String, i64, i64, i64, String);
         let rows: Vec<Row> = rows!(&mut **tx;

@@ -17,11 +17,9 @@ use crate::sqlx::{self, AnyPool, AssertSqlSafe};
 /// 10,000 vehicles stored no more in a second.
 const GROUP_MAX: usize = 256;
 
-/// A write of a vehicle.
 pub(super) trait VehicleWrite: Sized {
     type Done;
 
-    /// Returns the name of the vehicle.
     fn vehicle(&self) -> &str;
 
     /// Returns the write as one of a group.

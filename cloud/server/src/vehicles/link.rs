@@ -51,7 +51,6 @@ const LABEL_MAX: usize = 256;
 
 type VehicleSocket = WebSocketStream<TokioIo<Upgraded>>;
 
-/// The connection of a vehicle.
 struct VehicleLink<'c> {
     cloud: &'c Cloud,
     name: &'c str,
@@ -311,7 +310,6 @@ async fn parsed<T: Send + 'static>(
     blocking(move || Ok(parse())).await.map_err(failed)?
 }
 
-/// Returns the frame of a lease.
 fn lease(tail: &VehicleTail) -> Tail {
     let streams = tail.streams.iter().take(TAIL_STREAMS_MAX).cloned().collect();
     let seconds = (tail.until - now()).clamp(1, TAIL_S.into());

@@ -9,7 +9,6 @@ use gleaner_trust::sha256;
 use http_body_util::BodyExt;
 use hyper::{Method, StatusCode};
 use serde_json::{Value, json};
-use tempfile::TempDir;
 use tokio::io::AsyncWriteExt;
 use tokio::time::sleep;
 
@@ -102,8 +101,7 @@ pub(crate) async fn bytes(person: &Person, path: &str) -> (StatusCode, Vec<u8>) 
 
 #[tokio::test]
 async fn announced_clips_are_listed_once_by_vehicle_lambda_label_and_time() {
-    let folder = TempDir::new().unwrap();
-    let (server, admin) = start(&folder).await;
+    let (folder, server, admin) = start().await;
     let (vehicle, _) = admin.enrol("car-7").await;
     let (other, _) = admin.enrol("car-8").await;
     assert_eq!(orders(&vehicle).await, ClipOrders::default());
@@ -141,8 +139,7 @@ async fn announced_clips_are_listed_once_by_vehicle_lambda_label_and_time() {
 
 #[tokio::test]
 async fn a_wanted_clip_comes_in_parts_across_an_interruption_and_a_restart() {
-    let folder = TempDir::new().unwrap();
-    let (server, admin) = start(&folder).await;
+    let (folder, server, admin) = start().await;
     let (vehicle, _) = admin.enrol("car-7").await;
     let (mut link, ..) = vehicle.connect().await;
     let content = two_parts();
@@ -221,8 +218,7 @@ async fn a_wanted_clip_comes_in_parts_across_an_interruption_and_a_restart() {
 
 #[tokio::test]
 async fn an_announced_thumbnail_that_is_no_image_is_refused_once() {
-    let folder = TempDir::new().unwrap();
-    let (server, admin) = start(&folder).await;
+    let (_folder, server, admin) = start().await;
     let (vehicle, _) = admin.enrol("car-7").await;
     for (name, image) in [
         ("empty", &jpeg(0, 0)[..]),
@@ -246,8 +242,7 @@ async fn an_announced_thumbnail_that_is_no_image_is_refused_once() {
 
 #[tokio::test]
 async fn hostile_uploads_are_refused_and_change_nothing() {
-    let folder = TempDir::new().unwrap();
-    let (server, admin) = start(&folder).await;
+    let (_folder, server, admin) = start().await;
     let (good, _) = admin.enrol("good").await;
     let (bad, _) = admin.enrol("bad").await;
     for vehicle in [&good, &bad] {
@@ -320,8 +315,7 @@ async fn hostile_uploads_are_refused_and_change_nothing() {
 
 #[tokio::test]
 async fn the_policy_the_budget_and_the_vehicle_decide_what_is_sent() {
-    let folder = TempDir::new().unwrap();
-    let (server, admin) = start(&folder).await;
+    let (_folder, server, admin) = start().await;
     let (vehicle, _) = admin.enrol("car-7").await;
     let mut best = facts("best", "dark", 3000, b"best");
     best["moments"][0]["score"] = json!(0.9);

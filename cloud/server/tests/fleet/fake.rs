@@ -120,7 +120,6 @@ impl Person {
         String::from_utf8(text).unwrap().lines().map(str::to_owned).collect()
     }
 
-    /// Enrols a vehicle.
     pub(crate) async fn enrol(&self, name: &str) -> (FakeVehicle, Enrolment) {
         let enrolment = self.call(Method::POST, "/v1/vehicles", json!({ "name": name })).await;
         let enrolment = Enrolment::parse(enrolment.to_string().as_bytes()).unwrap();

@@ -3,14 +3,12 @@
 use gleaner_fleet::{Body, FRAME_MAX, Frame, Hello, LINES_MAX, Records, Reported, compress};
 use hyper::{Method, StatusCode};
 use serde_json::Value;
-use tempfile::TempDir;
 
 use crate::start;
 
 #[tokio::test]
 async fn a_hostile_frame_ends_its_own_connection_only() {
-    let folder = TempDir::new().unwrap();
-    let (server, admin) = start(&folder).await;
+    let (_folder, server, admin) = start().await;
     let (good, _) = admin.enrol("good").await;
     let (bad, _) = admin.enrol("bad").await;
     let (mut other, ..) = good.connect().await;
@@ -49,8 +47,7 @@ async fn a_hostile_frame_ends_its_own_connection_only() {
 
 #[tokio::test]
 async fn only_a_handshake_of_the_standard_opens_the_control_channel() {
-    let folder = TempDir::new().unwrap();
-    let (server, admin) = start(&folder).await;
+    let (_folder, server, admin) = start().await;
     let (vehicle, _) = admin.enrol("car-7").await;
     // Key and answer are the example of RFC 6455, section 1.3.
     let headers = [
@@ -80,8 +77,7 @@ async fn only_a_handshake_of_the_standard_opens_the_control_channel() {
 
 #[tokio::test]
 async fn requests_without_a_right_are_refused() {
-    let folder = TempDir::new().unwrap();
-    let (server, admin) = start(&folder).await;
+    let (_folder, server, admin) = start().await;
     let (vehicle, _) = admin.enrol("car-7").await;
     let (status, _) = vehicle.get("/v1/objects/..%2f..%2fcloud.db").await;
     assert_eq!(status, StatusCode::BAD_REQUEST);

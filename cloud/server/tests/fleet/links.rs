@@ -7,15 +7,13 @@ use gleaner_fleet::{Body, RenewRequest};
 use http_body_util::BodyExt;
 use hyper::{Method, StatusCode};
 use serde_json::{Value, json};
-use tempfile::TempDir;
 
 use crate::fake::{Person, csr, soon};
 use crate::{deploy, reported, signed, start};
 
 #[tokio::test]
 async fn a_newer_connection_takes_the_place_of_an_older_one() {
-    let folder = TempDir::new().unwrap();
-    let (server, admin) = start(&folder).await;
+    let (_folder, server, admin) = start().await;
     let (vehicle, _) = admin.enrol("car-7").await;
     let (mut older, ..) = vehicle.connect().await;
     let (mut newer, welcome, _) = vehicle.connect().await;
@@ -31,8 +29,7 @@ async fn a_newer_connection_takes_the_place_of_an_older_one() {
 
 #[tokio::test]
 async fn two_connections_of_a_vehicle_leave_it_online() {
-    let folder = TempDir::new().unwrap();
-    let (server, admin) = start(&folder).await;
+    let (_folder, server, admin) = start().await;
     let (vehicle, _) = admin.enrol("car-7").await;
     let mut link = vehicle.connect().await.0;
     let is_done = Arc::new(AtomicBool::new(false));
@@ -56,8 +53,7 @@ async fn two_connections_of_a_vehicle_leave_it_online() {
 
 #[tokio::test]
 async fn a_vehicle_that_is_enrolled_again_stays_connected_until_it_uses_that() {
-    let folder = TempDir::new().unwrap();
-    let (server, admin) = start(&folder).await;
+    let (_folder, server, admin) = start().await;
     let (former, _) = admin.enrol("car-7").await;
     let (mut link, ..) = former.connect().await;
     let (next, _) = admin.enrol("car-7").await;
@@ -71,8 +67,7 @@ async fn a_vehicle_that_is_enrolled_again_stays_connected_until_it_uses_that() {
 
 #[tokio::test]
 async fn no_change_is_missed_while_frames_are_handled() {
-    let folder = TempDir::new().unwrap();
-    let (server, admin) = start(&folder).await;
+    let (_folder, server, admin) = start().await;
     let (vehicle, _) = admin.enrol("car-7").await;
     deploy(&admin, &signed(1)).await;
     let (mut link, ..) = vehicle.connect().await;
@@ -94,8 +89,7 @@ async fn no_change_is_missed_while_frames_are_handled() {
 
 #[tokio::test]
 async fn a_vehicle_fetches_only_deployments_that_are_for_it() {
-    let folder = TempDir::new().unwrap();
-    let (server, admin) = start(&folder).await;
+    let (_folder, server, admin) = start().await;
     let (vehicle, _) = admin.enrol("car-7").await;
     let (other, _) = admin.enrol("car-8").await;
     let envelope = deploy(&admin, &signed(1)).await;
@@ -110,8 +104,7 @@ async fn a_vehicle_fetches_only_deployments_that_are_for_it() {
 
 #[tokio::test]
 async fn a_vehicle_in_a_loop_gets_few_certificates_and_connections() {
-    let folder = TempDir::new().unwrap();
-    let (server, admin) = start(&folder).await;
+    let (_folder, server, admin) = start().await;
     let (vehicle, _) = admin.enrol("car-7").await;
     let renew = RenewRequest { csr: csr(&rcgen::KeyPair::generate().unwrap()) };
     for number in 0..5 {
@@ -133,8 +126,7 @@ async fn a_vehicle_in_a_loop_gets_few_certificates_and_connections() {
 
 #[tokio::test]
 async fn a_stream_ends_with_its_user() {
-    let folder = TempDir::new().unwrap();
-    let (server, admin) = start(&folder).await;
+    let (_folder, server, admin) = start().await;
     let (vehicle, _) = admin.enrol("car-7").await;
     let (mut link, ..) = vehicle.connect().await;
     link.record(0..1).await;
@@ -151,8 +143,7 @@ async fn a_stream_ends_with_its_user() {
 
 #[tokio::test]
 async fn a_vehicle_learns_at_once_which_of_its_streams_are_followed() {
-    let folder = TempDir::new().unwrap();
-    let (server, admin) = start(&folder).await;
+    let (_folder, server, admin) = start().await;
     let (vehicle, _) = admin.enrol("car-7").await;
     let (mut link, ..) = vehicle.connect().await;
     let follow = async |path: &str| admin.open(Method::GET, path, b"").await.into_body();

@@ -27,11 +27,12 @@ async fn options(folder: &Path) -> ServeOptions {
     ServeOptions { store, ..ServeOptions::local(folder.join("data")) }
 }
 
-/// Starts a cloud; returns it with its administrator.
-async fn start(folder: &TempDir) -> (CloudServer, Person) {
+/// Starts a cloud; returns its folder, its server and its administrator.
+async fn start() -> (TempDir, CloudServer, Person) {
+    let folder = TempDir::new().unwrap();
     let server = CloudServer::start(&options(folder.path()).await).await.unwrap();
     let admin = Person::login(server.people, server.code.as_ref().unwrap()).await;
-    (server, admin)
+    (folder, server, admin)
 }
 
 /// A signed deployment of a lambda with one file.
@@ -105,8 +106,7 @@ fn reported(generation: u64) -> Body {
 
 #[tokio::test]
 async fn a_vehicle_enrols_gets_what_is_deployed_and_is_cut_off() {
-    let folder = TempDir::new().unwrap();
-    let (server, admin) = start(&folder).await;
+    let (_folder, server, admin) = start().await;
     let (vehicle, enrolment) = admin.enrol("car-7").await;
     assert_eq!(admin.vehicle("car-7").await["state"], "invited");
     assert_eq!(FakeVehicle::enrol(&enrolment).await.0, StatusCode::UNAUTHORIZED, "it works once");

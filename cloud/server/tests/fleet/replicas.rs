@@ -26,7 +26,6 @@ const NO_BUS: &str = "nats://127.0.0.1:9";
 struct Replicas {
     folder: TempDir,
     servers: [CloudServer; 2],
-    /// The administrator, at each of them.
     admins: [Person; 2],
 }
 
@@ -69,7 +68,6 @@ impl Replicas {
     }
 }
 
-/// Returns the next wanted state.
 async fn wanted(link: &mut FakeLink) -> gleaner_fleet::Desired {
     match link.next().await {
         Some(Body::Desired(desired)) => desired,

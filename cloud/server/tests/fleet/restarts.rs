@@ -18,8 +18,7 @@ use crate::{deploy, options, postgres, reported, signed, start};
 
 #[tokio::test]
 async fn a_restart_keeps_everything() {
-    let folder = TempDir::new().unwrap();
-    let (server, admin) = start(&folder).await;
+    let (folder, server, admin) = start().await;
     let second = CloudServer::start(&options(folder.path()).await).await.err().unwrap();
     assert!(second.message.starts_with("another gleaner-cloud uses"), "{second}");
     let other = TempDir::new().unwrap();
@@ -53,8 +52,7 @@ async fn a_restart_keeps_everything() {
 
 #[tokio::test]
 async fn many_records_move_into_files_and_are_read_and_found_as_before() {
-    let folder = TempDir::new().unwrap();
-    let (server, admin) = start(&folder).await;
+    let (folder, server, admin) = start().await;
     let (vehicle, _) = admin.enrol("car-7").await;
     let mut link = vehicle.connect().await.0;
     for part in 0..5 {

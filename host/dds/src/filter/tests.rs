@@ -95,11 +95,8 @@ fn a_fragment_that_claims_more_than_the_limit_is_dropped_in_either_byte_order() 
     ];
     for little in [true, false] {
         let packets = claims.map(|size| packet(FRIEND, &[fragment_of(little, size, 1000)]));
-        assert_eq!(
-            pass(&packets),
-            [true, true, true, true, true, false, false, false],
-            "little: {little}"
-        );
+        let expected = [true, true, true, true, true, false, false, false];
+        assert_eq!(pass(&packets), expected, "little: {little}");
         let nothing = packet(FRIEND, &[fragment_of(little, 1000, 0)]);
         assert_eq!(pass(&[nothing]), [false], "fragments of no bytes");
     }
@@ -177,10 +174,8 @@ fn fragments_of_strangers_are_dropped_and_their_other_packets_pass() {
     let packets = claims.map(|claim| packet(STRANGER, &[claim]));
     assert_eq!(pass(&packets), [false; 3]);
     assert_eq!(pass(&[packet(STRANGER, &[stamp(), data()]), packet(STRANGER, &[])]), [true; 2]);
-    assert!(
-        through(IMAGE, None, &packets).iter().all(|passed| *passed > 0),
-        "without a list of participants"
-    );
+    // Without a list of participants.
+    assert!(through(IMAGE, None, &packets).iter().all(|passed| *passed > 0));
     assert_eq!(through(IMAGE, Some(&[]), &[packet(FRIEND, &[fragment(1000)])]), [0]);
 }
 
@@ -240,11 +235,8 @@ fn ordinary_packets_pass_whole() {
     let contents =
         [dense, vec![pairs], vec![answer], big_endian, vec![empty_stamps], vec![last], vec![]];
     assert_eq!(pass(&contents.map(|content| packet(FRIEND, &content))), [true; 7]);
-    assert_eq!(
-        pass(&[b"RTPS\x02\x03\x01\x10\0DDSPING".to_vec()]),
-        [true],
-        "a ping is no packet of RTPS"
-    );
+    let ping = b"RTPS\x02\x03\x01\x10\0DDSPING".to_vec();
+    assert_eq!(pass(&[ping]), [true], "a ping is no packet of RTPS");
 }
 
 #[test]

@@ -18,33 +18,24 @@ fn listed() {
     let dds = Dds::open(DdsOptions { distro: Some(Distro::Humble), ..options(domain) }).unwrap();
     let peer = Peer::join(domain);
     let _chatter = peer.writer("/chatter", true, false);
-    let _strange = peer.writer_of::<Little>(
-        &peer.topic("rt/any", "Shape", &policies(false, true)),
-        &policies(false, true),
-    );
+    let _strange = peer.writer_of::<Little>("rt/any", "Shape", &policies(false, true));
     let _reader = peer.reader("rt/chatter", "std_msgs::msg::dds_::String_", &policies(true, false));
     let _own = dds.writer("/own", "std_msgs/msg/String", 1).unwrap();
     until("all of them", || {
         dds.discovered().iter().map(|topic| topic.writers + topic.readers).sum::<usize>() == 3
     });
     let [any, chatter] = &dds.discovered()[..] else { panic!("{:?}", dds.discovered()) };
-    assert_eq!(
-        (any.topic.as_str(), any.type_name.as_str(), any.writers, any.readers),
-        ("/any", "Shape", 1, 0)
-    );
+    let expected = ("/any", "Shape", 1, 0);
+    assert_eq!((any.topic.as_str(), any.type_name.as_str(), any.writers, any.readers), expected);
     assert_eq!(any.qos, ["best effort, transient local"]);
-    assert_eq!(
-        (chatter.type_name.as_str(), chatter.writers, chatter.readers),
-        ("std_msgs/msg/String", 1, 1)
-    );
+    let expected = ("std_msgs/msg/String", 1, 1);
+    assert_eq!((chatter.type_name.as_str(), chatter.writers, chatter.readers), expected);
     until("our entry in the graph", || dds.graph().starts_with("listed"));
     let topics = dds.topics();
     assert_eq!((topics[0].definitions_text.as_deref(), topics[0].messages), (None, None));
     assert!(topics[1].definitions_text.as_deref().unwrap().contains("string data"));
-    assert!(
-        topics[1].offered_qos.as_deref().unwrap().contains("reliability: 1\n  durability: 2\n"),
-        "{topics:?}"
-    );
+    let qos = topics[1].offered_qos.as_deref().unwrap();
+    assert!(qos.contains("reliability: 1\n  durability: 2\n"), "{qos}");
 }
 
 fn definitions() {
@@ -52,16 +43,11 @@ fn definitions() {
     let mut dds = open(domain);
     dds.subscribe(&spec("/subscribed", Qos::Auto), KeptSamples::new()).unwrap();
     let first = dds.definitions("/subscribed").unwrap();
-    assert!(
-        std::sync::Arc::ptr_eq(&first, &dds.definitions("/subscribed").unwrap()),
-        "all share them"
-    );
+    let second = dds.definitions("/subscribed").unwrap();
+    assert!(std::sync::Arc::ptr_eq(&first, &second), "all share them");
     assert!(matches!(dds.definitions("/subscribet"), Err(TransportError::NoSuchTopic { .. })));
     let peer = Peer::join(domain);
-    let _strange = peer.writer_of::<Little>(
-        &peer.topic("rt/any", "Shape", &policies(true, false)),
-        &policies(true, false),
-    );
+    let _strange = peer.writer_of::<Little>("rt/any", "Shape", &policies(true, false));
     let _chatter = peer.writer("/chatter", true, false);
     until("both", || dds.discovered().len() == 2);
     assert!(first.is_equivalent(&dds.definitions("/chatter").unwrap()), "it is the same type");
@@ -76,10 +62,7 @@ fn hostile_names() {
     let peer = Peer::join(domain);
     let long = format!("rt/{}", "n".repeat(2000));
     let _both = [("rt/\u{1b}[2J", "x\ny"), (long.as_str(), "x")].map(|(topic, type_name)| {
-        peer.writer_of::<Little>(
-            &peer.topic(topic, type_name, &policies(true, false)),
-            &policies(true, false),
-        )
+        peer.writer_of::<Little>(topic, type_name, &policies(true, false))
     });
     until("both", || dds.discovered().len() == 2);
     let found = dds.discovered();

@@ -31,8 +31,7 @@ fn message_of_a_node(gid: usize) -> Vec<u8> {
 }
 
 fn announce(peer: &Peer, gid: usize) -> LittleWriter {
-    let policies = policies(true, true);
-    let writer = peer.writer_of(&peer.topic(TOPIC, TYPE, &policies), &policies);
+    let writer = peer.writer_of(TOPIC, TYPE, &policies(true, true));
     write(&writer, &message_of_a_node(gid));
     writer
 }

@@ -7,7 +7,7 @@ use gleaner_transport::{LiveSource, Qos, Transport};
 use rustdds::{GUID, RTPSEntity};
 
 use super::Test;
-use super::peer::{KeptSamples, Peer, connected, domain, matched, open, spec, until, write};
+use super::peer::{Subscribed, connected, matched, subscribed, until, write};
 
 pub const TESTS: &[Test] = &[
     ("gaps_in_sequence_numbers_are_lost_samples_until_they_arrive_late", gaps),
@@ -82,54 +82,42 @@ fn counted(dds: &Dds) -> u64 {
 }
 
 /// The port at which the first participant of a domain receives data.
-pub fn port(domain: u16) -> u16 {
+fn port(domain: u16) -> u16 {
     7400 + 250 * domain + 11
 }
 
+/// Sends a packet to the first participant of a domain.
+pub fn send(domain: u16, packet: &[u8]) {
+    let wire = UdpSocket::bind("127.0.0.1:0").unwrap();
+    wire.send_to(packet, ("127.0.0.1", port(domain))).unwrap();
+}
+
 fn gaps() {
-    let domain = domain();
-    let mut dds = open(domain);
-    let sink = KeptSamples::new();
-    let subscription = dds.subscribe(&spec("/gaps", Qos::Auto), sink.clone()).unwrap();
-    let peer = Peer::join(domain);
+    let Subscribed { domain, dds, sink, subscription, peer } = subscribed("/gaps", Qos::Auto);
     let writer = peer.writer("/gaps", false, false);
     connected(&dds, subscription, 1);
     matched(&writer);
     write(&writer, b"1...");
     sink.wait(1);
-    let wire = UdpSocket::bind("127.0.0.1:0").unwrap();
     for (count, (seq, lost)) in
         [(5, 3), (6, 3), (3, 2), (9, 4), (4, 3), (2, 2), (8, 1)].into_iter().enumerate()
     {
-        wire.send_to(
-            &data(writer.guid(), seq, b"handcrafted", LITTLE),
-            ("127.0.0.1", port(domain)),
-        )
-        .unwrap();
+        send(domain, &data(writer.guid(), seq, b"handcrafted", LITTLE));
         assert_eq!(sink.wait(count + 2)[count + 1].0.seq, u64::try_from(seq).unwrap());
         until("the count", || dds.status(subscription).lost == Some(lost));
     }
 }
 
 fn malformed() {
-    let domain = domain();
-    let mut dds = open(domain);
-    let sink = KeptSamples::new();
-    let subscription = dds.subscribe(&spec("/odd", Qos::Auto), sink.clone()).unwrap();
-    let peer = Peer::join(domain);
+    let Subscribed { domain, dds, sink, subscription, peer } = subscribed("/odd", Qos::Auto);
     let writer = peer.writer("/odd", false, false);
     connected(&dds, subscription, 1);
     matched(&writer);
     write(&writer, b"1...");
     sink.wait(1);
-    let wire = UdpSocket::bind("127.0.0.1:0").unwrap();
     // PL_CDR and XCDR2; the fourth sample really is lost.
     for (seq, encoding) in [(2, [0, 3]), (3, [0, 7]), (5, LITTLE)] {
-        wire.send_to(
-            &data(writer.guid(), seq, b"handcrafted.", encoding),
-            ("127.0.0.1", port(domain)),
-        )
-        .unwrap();
+        send(domain, &data(writer.guid(), seq, b"handcrafted.", encoding));
     }
     sink.wait(2);
     until("the loss", || dds.status(subscription).lost != Some(0));
@@ -138,19 +126,14 @@ fn malformed() {
 }
 
 fn last_number() {
-    let domain = domain();
-    let mut dds = open(domain);
-    let sink = KeptSamples::new();
-    let subscription = dds.subscribe(&spec("/jump", Qos::Auto), sink.clone()).unwrap();
-    let peer = Peer::join(domain);
+    let Subscribed { domain, dds, sink, subscription, peer } = subscribed("/jump", Qos::Auto);
     let (writer, other) = (peer.writer("/jump", false, false), peer.writer("/jump", false, false));
     connected(&dds, subscription, 2);
     matched(&writer);
     write(&writer, b"1...");
     sink.wait(1);
-    let wire = UdpSocket::bind("127.0.0.1:0").unwrap();
     for seq in [i64::MAX, i64::MAX - 1, 0, -1, i64::MIN] {
-        wire.send_to(&data(writer.guid(), seq, b"?", LITTLE), ("127.0.0.1", port(domain))).unwrap();
+        send(domain, &data(writer.guid(), seq, b"?", LITTLE));
     }
     sink.mark(&other, b"still here..");
     assert!(dds.status(subscription).lost.unwrap() >= i64::MAX as u64 - 3);
@@ -158,11 +141,7 @@ fn last_number() {
 }
 
 fn broken() {
-    let domain = domain();
-    let mut dds = open(domain);
-    let sink = KeptSamples::new();
-    let subscription = dds.subscribe(&spec("/broken", Qos::Auto), sink.clone()).unwrap();
-    let peer = Peer::join(domain);
+    let Subscribed { domain, dds, sink, subscription, peer } = subscribed("/broken", Qos::Auto);
     let writer = peer.writer("/broken", true, false);
     connected(&dds, subscription, 1);
     let wire = UdpSocket::bind("127.0.0.1:0").unwrap();
@@ -202,17 +181,12 @@ fn broken() {
 }
 
 fn claims() {
-    let domain = domain();
-    let mut dds = open(domain);
-    let sink = KeptSamples::new();
-    let subscription = dds.subscribe(&spec("/claims", Qos::Auto), sink.clone()).unwrap();
-    let peer = Peer::join(domain);
+    let Subscribed { domain, dds, sink, subscription, peer } = subscribed("/claims", Qos::Auto);
     let writer = peer.writer("/claims", true, false);
     connected(&dds, subscription, 1);
     assert_eq!(dds.health().network.unwrap().unfiltered, None);
     let before = most_memory();
-    let wire = UdpSocket::bind("127.0.0.1:0").unwrap();
-    let send = |bytes: &[u8]| assert!(wire.send_to(bytes, ("127.0.0.1", port(domain))).is_ok());
+    let send = |bytes: &[u8]| send(domain, bytes);
     let begun = counted(&dds);
     let mut stranger = writer.guid().to_bytes();
     stranger[5] ^= 0xff;
@@ -233,11 +207,7 @@ fn claims() {
 }
 
 fn numbers() {
-    let domain = domain();
-    let mut dds = open(domain);
-    let sink = KeptSamples::new();
-    let subscription = dds.subscribe(&spec("/numbers", Qos::Auto), sink.clone()).unwrap();
-    let peer = Peer::join(domain);
+    let Subscribed { domain, dds, sink, subscription, peer } = subscribed("/numbers", Qos::Auto);
     let writer = peer.writer("/numbers", true, false);
     connected(&dds, subscription, 1);
     sink.mark(&writer, b"before..");
@@ -246,11 +216,10 @@ fn numbers() {
     let mut announcer = writer.guid().to_bytes();
     announcer[12..].copy_from_slice(&[0, 0, 3, 0xc2]);
     let (before, begun) = (most_memory(), counted(&dds));
-    let wire = UdpSocket::bind("127.0.0.1:0").unwrap();
     for guid in [writer.guid(), GUID::from_bytes(announcer)] {
         // Without the filter, some GiB each: enough to be noticed, without taking down the machine.
         for (kind, numbers) in [(7, [1, 1 << 28]), (8, [1 << 20, 1 << 26])] {
-            wire.send_to(&range(guid, kind, numbers), ("127.0.0.1", port(domain))).unwrap();
+            send(domain, &range(guid, kind, numbers));
         }
     }
     until("the count", || counted(&dds) - begun >= 4);

@@ -1,14 +1,15 @@
 //! Tests of writers whose samples have another layout, a key or an encoding that is not read.
 
 use gleaner_dds::Dds;
-use gleaner_transport::{DefinitionsSearch, Qos, TopicSpec, Transport};
+use gleaner_transport::{DefinitionsSearch, LiveSource, Qos, TopicSpec, Transport};
 use rustdds::policy::{DataRepresentation, XCDR2_DATA_REPRESENTATION};
 use rustdds::{GUID, Keyed, RTPSEntity, TopicKind};
 use serde::{Deserialize, Serialize};
 
 use super::Test;
 use super::peer::{
-    KeptSamples, Little, Peer, connected, domain, matched, open, policies, spec, until, write,
+    KeptSamples, Little, Peer, Subscribed, connected, domain, matched, open, policies, spec,
+    subscribed, until, write,
 };
 use super::type_query::{announce, announcement};
 
@@ -39,7 +40,7 @@ fn two_layouts() {
     let mut dds = open(domain);
     let sink = KeptSamples::new();
     let subscription = dds.subscribe(&spec("/name", Qos::Auto), sink.clone()).unwrap();
-    assert_eq!(dds.type_hash("/name").as_deref(), Some(STRING), "no writer announces one");
+    assert_eq!(dds.type_hash("/name"), None, "no writer announces one");
     // A participant each, since the announcements take the numbers of its own.
     let peers = [Peer::join(domain), Peer::join(domain), Peer::join(domain)];
     let [same, other, silent] = peers.each_ref().map(|peer| peer.writer("/name", true, false));
@@ -61,18 +62,20 @@ fn two_layouts() {
     sink.mark(&same, b"same");
     sink.mark(&silent, b"none");
     assert!(sink.bytes(2).iter().all(|bytes| bytes == b"same" || bytes == b"none"));
-    assert_eq!(dds.fix_layout(subscription, STRING), Ok(()));
-    assert_eq!(dds.fix_layout(subscription, &another), Err(STRING.to_owned()));
+    assert_eq!(dds.layout(subscription).as_deref(), Some(STRING));
 
-    // Of a type that is not at hand, the first writer fixes it.
-    let spec = gleaner_transport::TopicSpec {
-        type_name: "car_msgs/msg/Unknown".to_owned(),
-        ..spec("/later", Qos::Auto)
-    };
+    // Of a type that is not at hand, the first writer fixes it, also for later subscriptions.
+    let car = "car_msgs/msg/Unknown".to_owned();
+    let spec = TopicSpec { type_name: car, ..spec("/later", Qos::Auto) };
     let subscription = dds.subscribe(&spec, KeptSamples::new()).unwrap();
-    assert_eq!(dds.type_hash("/later"), None);
-    dds.fix_layout(subscription, &another).unwrap();
-    assert_eq!(dds.type_hash("/later").as_deref(), Some(&*another));
+    assert_eq!((dds.layout(subscription), dds.type_hash("/later")), (None, None));
+    let again = |seq| {
+        announcement(silent.guid(), seq, "rt/later", "car_msgs::msg::dds_::Unknown_", &another)
+    };
+    announce(domain, (1..20).map(again));
+    until("a layout", || dds.layout(subscription).as_deref() == Some(&*another));
+    let larger = dds.subscribe(&spec, KeptSamples::new()).unwrap();
+    assert_eq!(dds.layout(larger), Some(another));
 }
 
 #[derive(Serialize, Deserialize)]
@@ -86,11 +89,7 @@ impl Keyed for KeyedLong {
 }
 
 fn unmatched() {
-    let domain = domain();
-    let mut dds = open(domain);
-    let sink = KeptSamples::new();
-    let subscription = dds.subscribe(&spec("/keyed", Qos::Auto), sink.clone()).unwrap();
-    let peer = Peer::join(domain);
+    let Subscribed { mut dds, sink, subscription, peer, .. } = subscribed("/keyed", Qos::Auto);
     let reliable = policies(true, false);
     let (name, type_name) = ("rt/keyed".to_owned(), "std_msgs::msg::dds_::String_".to_owned());
     let topic = peer.0.create_topic(name, type_name, &reliable, TopicKind::WithKey).unwrap();
@@ -102,12 +101,10 @@ fn unmatched() {
     sink.mark(&other, b"read");
     assert_eq!(connected(&dds, subscription, 1).qos.as_deref(), Some("reliable, volatile"));
 
-    let mut xcdr2 = policies(true, false);
-    xcdr2 = xcdr2
+    let xcdr2 = policies(true, false)
         .with_data_representation(DataRepresentation { value: vec![XCDR2_DATA_REPRESENTATION] });
     let subscription = dds.subscribe(&spec("/xcdr2", Qos::Auto), KeptSamples::new()).unwrap();
-    let topic = peer.topic("rt/xcdr2", "std_msgs::msg::dds_::String_", &xcdr2);
-    let _xcdr2 = peer.writer_of::<Little>(&topic, &xcdr2);
+    let _xcdr2 = peer.writer_of::<Little>("rt/xcdr2", "std_msgs::msg::dds_::String_", &xcdr2);
     warned(&dds, subscription, "of `/xcdr2` offers only XCDR2, and nothing of it is received: let");
     assert_eq!(dds.status(subscription).writers, Some(0));
     let listed = |name: &str| dds.discovered().into_iter().find(|topic| topic.topic == name);
@@ -131,8 +128,7 @@ fn not_messages() {
         let policies = policies(true, false);
         let leaf = type_name.rsplit_once('/').unwrap().1;
         let dds_type = format!("{package}::dds_::{leaf}_");
-        let topic = peer.topic(&format!("rt{name}"), &dds_type, &policies);
-        let writer = peer.writer_of::<Little>(&topic, &policies);
+        let writer = peer.writer_of::<Little>(&format!("rt{name}"), &dds_type, &policies);
         connected(&dds, subscription, 1);
         matched(&writer);
         sink.mark(&writer, b"feedback");

@@ -21,23 +21,13 @@ mod write;
 use std::process::ExitCode;
 use std::sync::{PoisonError, RwLock};
 
-use libtest_mimic::{Arguments, Failed, Trial};
-
-type Test = (&'static str, fn());
+use network_namespace::Test;
 
 /// Held for reading by each test while it runs, and for writing by [`life::ALONE`]: that one checks
 /// all threads of this process.
 static RUNNING: RwLock<()> = RwLock::new(());
 
 fn main() -> ExitCode {
-    let arguments = Arguments::from_args();
-    let here = match network_namespace::inside() {
-        true => Ok(()),
-        false => match network_namespace::rerun() {
-            Ok(code) => return code,
-            Err(why) => Err(why),
-        },
-    };
     let tests = [
         type_query::TESTS,
         receive::TESTS,
@@ -51,17 +41,12 @@ fn main() -> ExitCode {
         unsubscribe::TESTS,
         first_sample::TESTS,
     ];
-    let trial = |&(name, test): &Test| match &here {
-        Ok(()) => Trial::test(name, move || -> Result<(), Failed> {
-            let is_alone = name == life::ALONE;
-            let _alone = is_alone.then(|| RUNNING.write().unwrap_or_else(PoisonError::into_inner));
-            let _beside =
-                (!is_alone).then(|| RUNNING.read().unwrap_or_else(PoisonError::into_inner));
-            test();
-            Ok(())
-        }),
-        Err(why) => Trial::test(format!("{name} [{why}]"), || Ok(())).with_ignored_flag(true),
-    };
-    let trials = tests.into_iter().flatten().map(trial).collect();
-    libtest_mimic::run(&arguments, trials).exit_code()
+    network_namespace::run_tests(tests.into_iter().flatten().copied(), run)
+}
+
+fn run((name, test): Test) {
+    let is_alone = name == life::ALONE;
+    let _alone = is_alone.then(|| RUNNING.write().unwrap_or_else(PoisonError::into_inner));
+    let _beside = (!is_alone).then(|| RUNNING.read().unwrap_or_else(PoisonError::into_inner));
+    test();
 }

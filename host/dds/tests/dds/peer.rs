@@ -85,7 +85,7 @@ impl Peer {
         Self(DomainParticipant::new(domain).unwrap())
     }
 
-    pub fn topic(&self, name: &str, type_name: &str, policies: &QosPolicies) -> Topic {
+    fn topic(&self, name: &str, type_name: &str, policies: &QosPolicies) -> Topic {
         self.0
             .create_topic(name.to_owned(), type_name.to_owned(), policies, TopicKind::NoKey)
             .unwrap()
@@ -93,20 +93,19 @@ impl Peer {
 
     pub fn writer_of<A: SerializerAdapter<Bytes>>(
         &self,
-        topic: &Topic,
+        topic: &str,
+        type_name: &str,
         policies: &QosPolicies,
     ) -> DataWriter<Bytes, A> {
+        let topic = self.topic(topic, type_name, policies);
         let publisher = self.0.create_publisher(policies).unwrap();
-        publisher.create_datawriter_no_key(topic, Some(policies.clone())).unwrap()
+        publisher.create_datawriter_no_key(&topic, Some(policies.clone())).unwrap()
     }
 
     /// A writer of `std_msgs/msg/String`.
     pub fn writer(&self, topic: &str, reliable: bool, transient_local: bool) -> LittleWriter {
         let policies = policies(reliable, transient_local);
-        self.writer_of(
-            &self.topic(&format!("rt{topic}"), "std_msgs::msg::dds_::String_", &policies),
-            &policies,
-        )
+        self.writer_of(&format!("rt{topic}"), "std_msgs::msg::dds_::String_", &policies)
     }
 
     pub fn reader(
@@ -125,6 +124,23 @@ impl Peer {
 pub fn take(reader: &SimpleDataReader<Vec<u8>, Little>) -> Option<Vec<u8>> {
     reader.drain_read_notifications();
     reader.try_take_one_with(Whole).unwrap().map(|change| change.into_value())
+}
+
+/// A subscription, and a peer that has joined the domain after it.
+pub struct Subscribed {
+    pub domain: u16,
+    pub dds: Dds,
+    pub sink: Arc<KeptSamples>,
+    pub subscription: Subscription,
+    pub peer: Peer,
+}
+
+pub fn subscribed(topic: &str, qos: Qos) -> Subscribed {
+    let domain = domain();
+    let mut dds = open(domain);
+    let sink = KeptSamples::new();
+    let subscription = dds.subscribe(&spec(topic, qos), sink.clone()).unwrap();
+    Subscribed { domain, dds, sink, subscription, peer: Peer::join(domain) }
 }
 
 /// Waits until a writer is matched; samples written before are not sent to that reader.

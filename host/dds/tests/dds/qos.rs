@@ -1,14 +1,13 @@
 //! Tests of offered and requested quality of service.
 
-use std::net::UdpSocket;
-
 use gleaner_transport::{Qos, Transport};
 use rustdds::RTPSEntity;
 
 use super::Test;
-use super::hostile::{LITTLE, data, port};
+use super::hostile::{LITTLE, data, send};
 use super::peer::{
-    KeptSamples, Peer, connected, domain, matched, open, policies, spec, until, write,
+    KeptSamples, Little, Peer, Subscribed, connected, domain, matched, open, policies, spec,
+    subscribed, until, write,
 };
 
 pub const TESTS: &[Test] = &[
@@ -21,12 +20,8 @@ pub const TESTS: &[Test] = &[
 ];
 
 fn auto_adapts() {
-    let domain = domain();
-    let mut dds = open(domain);
-    let sink = KeptSamples::new();
-    let subscription = dds.subscribe(&spec("/mixed", Qos::Auto), sink.clone()).unwrap();
+    let Subscribed { domain, dds, sink, subscription, peer } = subscribed("/mixed", Qos::Auto);
     assert_eq!(dds.status(subscription).qos, None, "no writer yet");
-    let peer = Peer::join(domain);
     let reliable = peer.writer("/mixed", true, false);
     assert_eq!(connected(&dds, subscription, 1).qos.as_deref(), Some("reliable, volatile"));
     matched(&reliable);
@@ -43,19 +38,12 @@ fn auto_adapts() {
     sink.mark(&reliable, b"from the first..");
     let samples = sink.bytes(12);
     for n in 0..10 {
-        assert_eq!(
-            samples.iter().filter(|bytes| **bytes == [n; 4]).count(),
-            1,
-            "no sample arrives twice"
-        );
+        let count = samples.iter().filter(|bytes| **bytes == [n; 4]).count();
+        assert_eq!(count, 1, "no sample arrives twice");
     }
     let qos_warnings = dds.status(subscription).qos_warnings;
-    assert!(
-        qos_warnings
-            .iter()
-            .any(|line| line.contains("differ") && line.contains("best effort, volatile")),
-        "{qos_warnings:?}"
-    );
+    let differ = |line: &String| line.contains("differ") && line.contains("best effort, volatile");
+    assert!(qos_warnings.iter().any(differ), "{qos_warnings:?}");
     assert!(qos_warnings.iter().any(|line| line.contains("re-subscribed")), "{qos_warnings:?}");
 }
 
@@ -78,11 +66,7 @@ fn auto_transient_local() {
 }
 
 fn auto_recovers() {
-    let domain = domain();
-    let mut dds = open(domain);
-    let sink = KeptSamples::new();
-    let subscription = dds.subscribe(&spec("/driver", Qos::Auto), sink.clone()).unwrap();
-    let peer = Peer::join(domain);
+    let Subscribed { dds, sink, subscription, peer, .. } = subscribed("/driver", Qos::Auto);
     let weak = peer.writer("/driver", false, false);
     assert_eq!(connected(&dds, subscription, 1).qos.as_deref(), Some("best effort, volatile"));
     let strong = peer.writer("/driver", true, false);
@@ -117,16 +101,11 @@ fn fixed_does_not_fit() {
 }
 
 fn another_type() {
-    let domain = domain();
-    let mut dds = open(domain);
-    let sink = KeptSamples::new();
-    let subscription = dds.subscribe(&spec("/typed", Qos::Auto), sink.clone()).unwrap();
-    let peer = Peer::join(domain);
+    let Subscribed { dds, sink, subscription, peer, .. } = subscribed("/typed", Qos::Auto);
     let same = peer.writer("/typed", true, false);
     connected(&dds, subscription, 1);
     let policies = policies(true, false);
-    let topic = peer.topic("rt/typed", "sensor_msgs::msg::dds_::Imu_", &policies);
-    let other = peer.writer_of::<super::peer::Little>(&topic, &policies);
+    let other = peer.writer_of::<Little>("rt/typed", "sensor_msgs::msg::dds_::Imu_", &policies);
     matched(&other);
     // At once, before its type was looked up.
     write(&other, b"of the other");
@@ -135,31 +114,21 @@ fn another_type() {
         dds.status(subscription).qos_warnings.iter().any(|line| line == skipped)
     });
     let qos_warnings = dds.status(subscription).qos_warnings;
-    assert!(
-        qos_warnings[0].contains("sends `sensor_msgs/msg/Imu`, not `std_msgs/msg/String`"),
-        "{qos_warnings:?}"
-    );
+    let expected = "sends `sensor_msgs/msg/Imu`, not `std_msgs/msg/String`";
+    assert!(qos_warnings[0].contains(expected), "{qos_warnings:?}");
     sink.mark(&same, b"correct.");
     assert!(sink.bytes(1).iter().all(|bytes| bytes == b"correct."));
 }
 
 fn far_ahead() {
-    let domain = domain();
-    let mut dds = open(domain);
-    let sink = KeptSamples::new();
-    let subscription = dds.subscribe(&spec("/far", Qos::Auto), sink.clone()).unwrap();
-    let peer = Peer::join(domain);
+    let Subscribed { domain, dds, sink, subscription, peer } = subscribed("/far", Qos::Auto);
     let writer = peer.writer("/far", false, true);
-    assert_eq!(
-        connected(&dds, subscription, 1).qos.as_deref(),
-        Some("best effort, transient local")
-    );
+    let status = connected(&dds, subscription, 1);
+    assert_eq!(status.qos.as_deref(), Some("best effort, transient local"));
     matched(&writer);
     write(&writer, b"1...");
     sink.wait(1);
-    let wire = UdpSocket::bind("127.0.0.1:0").unwrap();
-    wire.send_to(&data(writer.guid(), 1 << 40, b"far.", LITTLE), ("127.0.0.1", port(domain)))
-        .unwrap();
+    send(domain, &data(writer.guid(), 1 << 40, b"far.", LITTLE));
     sink.wait(2);
     let _less = peer.writer("/far", false, false);
     assert_eq!(connected(&dds, subscription, 2).qos.as_deref(), Some("best effort, volatile"));

@@ -96,6 +96,11 @@ fn source(name: &str, text: &str) -> (String, String, String) {
     (format!("car_msgs/msg/{name}"), "msg".to_owned(), text.to_owned())
 }
 
+fn request(type_name: &str, type_hash: &str) -> Request {
+    let (type_name, type_hash) = (type_name.to_owned(), type_hash.to_owned());
+    Request { type_name, type_hash, include_type_sources: true }
+}
+
 /// The correct answer of a node.
 fn honest(request: &Request) -> Response {
     let tyre = described("Tyre", &[("bar", 11, "")]);
@@ -308,19 +313,12 @@ fn answered(mapping: ServiceMapping) {
     let definitions = dds.definitions("/wheel").unwrap();
     assert!(FieldPath::compile(&definitions, "tyre.bar").is_ok());
     assert!(text(&dds, "/wheel").unwrap().starts_with("# One of four.\n"));
-    let request = |type_name: &str, hash: &str| Request {
-        type_name: type_name.to_owned(),
-        type_hash: hash.to_owned(),
-        include_type_sources: true,
-    };
     // On a slow machine there may be repeated requests.
     let mut requests = car.requests.lock().unwrap().clone();
     requests.sort_by(|a, b| b.type_name.cmp(&a.type_name));
     requests.dedup();
-    assert_eq!(
-        requests,
-        [request("car_msgs/msg/Wheel", WHEEL), request("car_msgs/msg/Tyre", TYRE)]
-    );
+    let expected = [request("car_msgs/msg/Wheel", WHEEL), request("car_msgs/msg/Tyre", TYRE)];
+    assert_eq!(requests, expected);
 }
 
 /// With plain RustDDS, and with a header: see `docs/dds-limits.md` on the case without.
@@ -338,18 +336,12 @@ fn long() {
     let (name, ty) = service("rq", "Request");
     let requests = peer.reader(&format!("{name}Request"), &ty, &policies);
     let (name, ty) = service("rr", "Response");
-    let replies =
-        peer.writer_of::<Little>(&peer.topic(&format!("{name}Reply"), &ty, &policies), &policies);
+    let replies = peer.writer_of::<Little>(&format!("{name}Reply"), &ty, &policies);
     let _ready = peer.writer("/ready", true, false);
     until("the service", || dds.discovered().iter().any(|topic| topic.topic == "/ready"));
     car.announce_hashes(&dds, domain);
 
-    let request = Request {
-        type_name: "car_msgs/msg/Wheel".to_owned(),
-        type_hash: WHEEL.to_owned(),
-        include_type_sources: true,
-    };
-    let mut answer = honest(&request);
+    let mut answer = honest(&request("car_msgs/msg/Wheel", WHEEL));
     answer.sources[0].2 += &"# A long story.\n".repeat(TEXT / 16);
     let answer = CDRSerializerAdapter::<Response>::to_bytes(&answer).unwrap();
     until("the end of the query", || {

@@ -8,7 +8,8 @@ use gleaner_transport::{LiveSource, Qos, ReceptionStatus, Subscription, Transpor
 
 use super::Test;
 use super::peer::{
-    KeptSamples, Peer, connected, domain, matched, open, options, spec, until, write,
+    KeptSamples, Peer, Subscribed, connected, domain, matched, open, options, spec, subscribed,
+    until, write,
 };
 
 pub const TESTS: &[Test] = &[
@@ -20,11 +21,7 @@ pub const TESTS: &[Test] = &[
 ];
 
 fn ended() {
-    let domain = domain();
-    let mut dds = open(domain);
-    let sink = KeptSamples::new();
-    let subscription = dds.subscribe(&spec("/ended", Qos::Auto), sink.clone()).unwrap();
-    let peer = Peer::join(domain);
+    let Subscribed { mut dds, sink, subscription, peer, .. } = subscribed("/ended", Qos::Auto);
     let writer = peer.writer("/ended", true, false);
     connected(&dds, subscription, 1);
     sink.mark(&writer, b"mark");
@@ -129,11 +126,7 @@ fn many() {
 }
 
 fn before_match() {
-    let domain = domain();
-    let mut dds = open(domain);
-    let sink = KeptSamples::new();
-    let subscription = dds.subscribe(&spec("/early", Qos::Auto), sink.clone()).unwrap();
-    let peer = Peer::join(domain);
+    let Subscribed { dds, sink, subscription, peer, .. } = subscribed("/early", Qos::Auto);
     let writer = peer.writer("/early", true, false);
     sink.mark(&writer, b"mark");
     write(&writer, b"next");

@@ -29,10 +29,8 @@ fn written() {
         came.extend(take(&reader));
         came.len() == 50
     });
-    assert!(
-        came.iter().enumerate().all(|(n, bytes)| *bytes == [n as u8; 332]),
-        "in order, unchanged"
-    );
+    let is_right = |(n, bytes): (usize, &Vec<u8>)| *bytes == [n as u8; 332];
+    assert!(came.iter().enumerate().all(is_right), "in order, unchanged");
     drop(reader);
     until("no reader", || writer.readers() == 0);
 }
@@ -49,10 +47,8 @@ fn unacknowledged() {
     let guid = [&prefix[..12], &[9, 9, 9, 4]].concat();
     let guid = GUID::from_bytes(guid.try_into().unwrap());
     // Sequence numbers that were used are ignored.
-    announce(
-        domain,
-        (1..20).map(|seq| announcement(guid, seq, "rt/event", "std_msgs::msg::dds_::String_", "")),
-    );
+    let again = |seq| announcement(guid, seq, "rt/event", "std_msgs::msg::dds_::String_", "");
+    announce(domain, (1..20).map(again));
     until("a reader", || writer.readers() == 1);
     let sent = (0..9000).take_while(|_| writer.write(&[1; 8]).is_ok()).count();
     assert_eq!(sent, 300);

@@ -3,7 +3,6 @@
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use gleaner_messages::Endian;
 use gleaner_transport::{
     Clock, Delivery, Guid, PublishError, Publisher, SampleMeta, Sink, Subscription,
 };
@@ -91,16 +90,7 @@ impl Publisher for LoopedPublisher {
     fn publish(&self, cdr: &[u8]) -> Result<(), PublishError> {
         let seq = self.published.fetch_add(1, Ordering::Relaxed) + 1;
         let at_ns = self.route.clock.now();
-        let meta = SampleMeta {
-            at_ns,
-            publish_ns: at_ns,
-            writer: self.writer,
-            seq,
-            endian: Endian::Little,
-            options: [0; 2],
-            layout: 0,
-            is_latched: false,
-        };
+        let meta = SampleMeta::new(at_ns, self.writer, seq);
         self.route.deliver(&meta, cdr);
         Ok(())
     }

@@ -1,16 +1,16 @@
 //! Tests metadata of channels: the writer of their messages, and the offered QoS.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::io::Cursor;
 use std::path::PathBuf;
 
 use gleaner_drives::{Damage, Replay, ReplayError, ReplayStep};
-use gleaner_transport::{Guid, Transport};
-use mcap::records::MessageHeader;
+use gleaner_transport::{DiscoveredTopic, Guid, Transport};
 
-use crate::support::{TEXT, TYPE, Written, file, listen, record, run, small_chunks, write};
+use crate::support::{
+    MAGIC, TEXT, TYPE, Written, add_channel, begin, file, finish, listen, record, run, run_whole,
+    text, write, write_data,
+};
 
-const MAGIC: &[u8; 8] = b"\x89MCAP0\r\n";
 const CLAIM: &str = "00112233445566778899aabbccddeeff";
 
 /// A channel to write: its topic, and one pair of metadata.
@@ -18,7 +18,7 @@ type ChannelSpec<'a> = (&'static str, &'a str, &'a str);
 
 /// Creates a drive with two messages on each of `channels`, in turn, all numbered 1 and 2.
 fn drive_of(channels: &[ChannelSpec<'_>], first: u64) -> PathBuf {
-    let mut writer = small_chunks().create(Cursor::new(Vec::new())).unwrap();
+    let mut writer = begin();
     let schema = writer.add_schema(TYPE, "ros2msg", TEXT.as_bytes()).unwrap();
     let ids: Vec<u16> = channels
         .iter()
@@ -36,16 +36,13 @@ fn drive_of(channels: &[ChannelSpec<'_>], first: u64) -> PathBuf {
             write(&mut writer, *id, &Written { topic, at, sequence, value: n as i64 });
         }
     }
-    writer.finish().unwrap();
-    file(&writer.into_inner().into_inner())
+    file(&finish(writer))
 }
 
 fn steps(paths: &[PathBuf], topics: &[&str]) -> Vec<ReplayStep> {
     let mut replay = Replay::open(paths).unwrap();
     listen(&mut replay, topics);
-    let (steps, error) = run(&mut replay);
-    assert!(error.is_none(), "{error:?}");
-    steps
+    run_whole(&mut replay)
 }
 
 /// Returns the writers in the order of their first message, and checks that the numbers of each
@@ -70,15 +67,12 @@ fn made_up(file: u32, channel: u32) -> String {
 
 #[test]
 fn a_message_keeps_the_options_of_its_encapsulation() {
-    let mut writer = small_chunks().create(Cursor::new(Vec::new())).unwrap();
-    let schema = writer.add_schema(TYPE, "ros2msg", TEXT.as_bytes()).unwrap();
-    let channel_id = writer.add_channel(schema, "/a", "cdr", &BTreeMap::new()).unwrap();
+    let mut writer = begin();
+    let channel = add_channel(&mut writer, "/a", TEXT);
     for (endian, log_time) in [(0, 1), (1, 2)] {
-        let header = MessageHeader { channel_id, sequence: 0, log_time, publish_time: 0 };
-        writer.write_to_known_channel(&header, &[0, endian, 7, 9, 0, 0, 0, 0, 0, 0, 0, 0]).unwrap();
+        write_data(&mut writer, channel, log_time, &[0, endian, 7, 9, 0, 0, 0, 0, 0, 0, 0, 0]);
     }
-    writer.finish().unwrap();
-    let steps = steps(&[file(&writer.into_inner().into_inner())], &["/a"]);
+    let steps = steps(&[file(&finish(writer))], &["/a"]);
     assert!(steps.iter().map(|step| step.meta.options).eq([[7, 9]; 2]));
 }
 
@@ -158,13 +152,9 @@ fn a_topic_has_the_qos_of_its_first_channel_that_has_one() {
     assert_eq!(qos(&[first, second]), [Some(fits), Some("- depth: 1\n".to_owned()), None]);
 }
 
-fn text(text: &str) -> Vec<u8> {
-    [&(text.len() as u32).to_le_bytes()[..], text.as_bytes()].concat()
-}
-
 /// Returns the damage and the topics of a file that ends after one channel, whose record ends with
 /// `metadata`.
-fn ending(metadata: &[u8]) -> (Damage, Vec<gleaner_transport::DiscoveredTopic>) {
+fn ending(metadata: &[u8]) -> (Damage, Vec<DiscoveredTopic>) {
     let schema = [&1u16.to_le_bytes()[..], &text(TYPE), &text("ros2msg"), &text(TEXT)].concat();
     let channel =
         [&1u16.to_le_bytes()[..], &1u16.to_le_bytes(), &text("/a"), &text("cdr"), metadata]
@@ -178,10 +168,14 @@ fn ending(metadata: &[u8]) -> (Damage, Vec<gleaner_transport::DiscoveredTopic>) 
     }
 }
 
+/// Encodes a map of a record.
+fn map(pairs: &[u8]) -> Vec<u8> {
+    [&(pairs.len() as u32).to_le_bytes()[..], pairs].concat()
+}
+
 #[test]
 fn a_channel_whose_metadata_is_malformed_is_damage() {
     let pair = [text("key"), text("value")].concat();
-    let map = |bytes: &[u8]| [&(bytes.len() as u32).to_le_bytes()[..], bytes].concat();
     for bad in [
         vec![0; 3],
         u32::MAX.to_le_bytes().to_vec(),
@@ -203,7 +197,6 @@ fn a_channel_whose_metadata_is_malformed_is_damage() {
 fn unneeded_metadata_is_skipped() {
     let qos = [text("offered_qos_profiles"), text("- depth: 1")].concat();
     let foreign = [&[2, 0, 0, 0, 0xff, 0xfe][..], &text("value")].concat();
-    let map = |bytes: &[u8]| [&(bytes.len() as u32).to_le_bytes()[..], bytes].concat();
     for (metadata, expected) in [
         (Vec::new(), None),
         (map(&[]), None),

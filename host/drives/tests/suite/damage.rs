@@ -1,11 +1,12 @@
 //! Tests damaged drives: all promised messages come first, then one error with position and cause.
 
-use gleaner_drives::{Damage, DamageLocation, DriveLimits, Replay, ReplayError};
+use gleaner_drives::{Damage, DriveLimits, Replay};
 use mcap::WriteOptions;
 use mcap::records::ChunkIndex;
 
 use crate::support::{
-    Written, drive, expected, file, listen, replayed, run, small_chunks, ticking,
+    TEXT, Written, add_channel, begin, damage, drive, expected, file, finish, listen, replayed,
+    run, run_whole, small_chunks, ticking, write, write_data,
 };
 
 const TOPICS: [&str; 2] = ["/a", "/b"];
@@ -21,13 +22,6 @@ fn chunks(bytes: &[u8]) -> Vec<(ChunkIndex, usize)> {
     indexes.sort_by_key(|index| index.chunk_start_offset);
     let count = |index: &ChunkIndex| summary.stream_chunk(bytes, index).unwrap().count();
     indexes.into_iter().map(|index| (index.clone(), count(&index))).collect()
-}
-
-fn damage(error: Option<ReplayError>) -> (u64, Damage) {
-    match error {
-        Some(ReplayError::Damaged { at: DamageLocation::Byte(offset), what, .. }) => (offset, what),
-        other => panic!("expected damage, got {other:?}"),
-    }
 }
 
 #[test]
@@ -169,30 +163,19 @@ fn fewer_messages_than_the_summary_counts_are_noticed_at_the_end() {
 
 #[test]
 fn messages_that_are_not_cdr_are_left_out_and_counted() {
-    use std::collections::BTreeMap;
-    use std::io::Cursor;
     // No bytes, a list of parameters, XCDR2 plain and delimited.
     for bad in [&[][..], &[0, 1, 0], &[0, 3, 0, 0, 1], &[0, 7, 0, 0, 1], &[0, 9, 0, 0, 1]] {
-        let mut writer = small_chunks().create(Cursor::new(Vec::new())).unwrap();
-        let schema = writer.add_schema(crate::support::TYPE, "ros2msg", b"int64 value").unwrap();
-        let channel_id = writer.add_channel(schema, "/a", "cdr", &BTreeMap::new()).unwrap();
+        let mut writer = begin();
+        let channel = add_channel(&mut writer, "/a", TEXT);
         for (n, message) in ticking(&["/a"], 6, 10).iter().enumerate() {
             if n == 3 {
-                let header = mcap::records::MessageHeader {
-                    channel_id,
-                    sequence: 0,
-                    log_time: 35,
-                    publish_time: 0,
-                };
-                writer.write_to_known_channel(&header, bad).unwrap();
+                write_data(&mut writer, channel, 35, bad);
             }
-            crate::support::write(&mut writer, channel_id, message);
+            write(&mut writer, channel, message);
         }
-        writer.finish().unwrap();
-        let mut replay = Replay::open(&[file(&writer.into_inner().into_inner())]).unwrap();
+        let mut replay = Replay::open(&[file(&finish(writer))]).unwrap();
         let memory = listen(&mut replay, &["/a"]);
-        let (steps, error) = run(&mut replay);
-        assert!(error.is_none(), "{error:?}");
+        let steps = run_whole(&mut replay);
         assert!(memory.values().iter().map(|(_, value)| *value).eq(0..6));
         // Time passes with it, as for every other message.
         assert!(steps.len() == 7 && steps[3].at_ns == 35);

@@ -8,9 +8,10 @@ use gleaner_drives::{Attachment, Damage, Extras, ReplayError, read_extras};
 use mcap::WriteOptions;
 use mcap::records::Metadata;
 
-use crate::support::{TEXT, TYPE, file, record, small_chunks, ticking, write};
+use crate::support::{
+    MAGIC, TEXT, add_channel, file, finish, finished, record, small_chunks, ticking, write,
+};
 
-const MAGIC: &[u8; 8] = b"\x89MCAP0\r\n";
 const LIMIT: u64 = 1 << 20;
 
 fn pairs(pairs: &[(&str, &str)]) -> BTreeMap<String, String> {
@@ -53,8 +54,7 @@ fn clip(options: WriteOptions) -> Vec<u8> {
         data: Cow::Owned(attachment.data),
     });
     writer.write_metadata(&metadata.next().unwrap()).unwrap();
-    let schema = writer.add_schema(TYPE, "ros2msg", TEXT.as_bytes()).unwrap();
-    let channel = writer.add_channel(schema, "/a", "cdr", &BTreeMap::new()).unwrap();
+    let channel = add_channel(&mut writer, "/a", TEXT);
     for message in ticking(&["/a"], 20, 100) {
         write(&mut writer, channel, &message);
     }
@@ -64,8 +64,7 @@ fn clip(options: WriteOptions) -> Vec<u8> {
     }
     metadata.for_each(|metadata| writer.write_metadata(&metadata).unwrap());
     attachments.for_each(|attachment| writer.attach(&attachment).unwrap());
-    writer.finish().unwrap();
-    writer.into_inner().into_inner()
+    finish(writer)
 }
 
 fn read(bytes: &[u8], limit_bytes: u64) -> Result<Extras, ReplayError> {
@@ -86,11 +85,6 @@ fn damage(read: Result<Extras, ReplayError>) -> Damage {
 /// Returns the first position of `needle` in `bytes`.
 fn find(bytes: &[u8], needle: &[u8]) -> usize {
     bytes.windows(needle.len()).position(|window| window == needle).unwrap()
-}
-
-/// Returns a file of these records that looks finished.
-fn finished(records: &[Vec<u8>]) -> Vec<u8> {
-    [&MAGIC[..], &records.concat(), &record(15, &[0; 4]), &record(2, &[0; 20]), MAGIC].concat()
 }
 
 #[test]
@@ -175,10 +169,8 @@ fn the_error_names_an_attachment_with_a_wrong_checksum() {
     let at = find(&bytes, &[0xff, 0xd8, 1, 2, 3]);
     bytes[at + 2] = 9;
     let what = damage(read(&bytes, LIMIT));
-    assert!(
-        matches!(&what, Damage::AttachmentCrc { name, .. } if name == "thumbnail.jpg"),
-        "{what}"
-    );
+    let Damage::AttachmentCrc { name, .. } = &what else { panic!("{what}") };
+    assert_eq!(name, "thumbnail.jpg");
     // The checksum also covers the bytes before the data.
     let mut bytes = clip(small_chunks());
     let at = find(&bytes, b"image/jpeg");
@@ -218,10 +210,8 @@ fn more_than_the_limit_is_refused_before_memory_is_allocated() {
     let needed = (0..LIMIT).find(|limit| read(&bytes, *limit).is_ok()).unwrap();
     assert_eq!(read(&bytes, needed).unwrap(), held());
     let what = damage(read(&bytes, needed - 1));
-    assert_eq!(
-        what.to_string(),
-        format!("its metadata and attachments take more than {} bytes", needed - 1)
-    );
+    let expected = format!("its metadata and attachments take more than {} bytes", needed - 1);
+    assert_eq!(what.to_string(), expected);
     // A truncated file has the same limit.
     assert!(matches!(
         damage(read(&bytes[..bytes.len() - 1], 10)),

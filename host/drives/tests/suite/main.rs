@@ -8,4 +8,5 @@ mod extras;
 mod flips;
 mod invalid;
 mod replay;
+mod separate;
 mod support;

@@ -1,18 +1,16 @@
 //! Tests undamaged drives: every message once, in order, for every layout of the file.
 
-use std::collections::BTreeMap;
-use std::io::Cursor;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use gleaner_drives::{DriveLimits, DriveOptions, Progress, Replay, ReplayError};
 use gleaner_messages::{CompressedView, Endian, FieldPath, header_stamp};
 use gleaner_transport::{Subscription, TopicSpec, Transport, TransportError};
-use mcap::records::MessageHeader;
 use mcap::{Compression, WriteOptions};
 
 use crate::support::{
-    MemorySink, TYPE, Written, drive, expected, file, listen, replayed, run, sample_drive,
-    small_chunks, spec, ticking, write,
+    MemorySink, TEXT, TYPE, Written, add_channel, begin, delivered, drive, expected, file, finish,
+    listen, replayed, run, run_whole, sample_drive, small_chunks, spec, ticking, write, write_data,
 };
 
 const SAMPLE: [(&str, &str, u64); 3] = [
@@ -31,8 +29,7 @@ fn the_sample_drive_matches_its_description() {
         replay.subscribe(&spec, memory.clone()).unwrap();
         memory
     });
-    let (steps, error) = run(&mut replay);
-    assert!(error.is_none(), "{error:?}");
+    let steps = run_whole(&mut replay);
     assert!(steps.is_sorted_by_key(|step| step.at_ns));
     assert_eq!(replay.progress(), Progress { done: 7886, total: Some(7886) });
     assert_eq!(replay.start_ns(), steps.first().map(|step| step.at_ns));
@@ -130,8 +127,7 @@ fn past_the_memory_limit_order_is_lost_and_counted_but_no_message_is() {
     let limits = DriveLimits { open_bytes: 1000, ..DriveLimits::default() };
     let mut replay = Replay::open_with(&[path], limits).unwrap();
     let memory = listen(&mut replay, &["/a"]);
-    let (_, error) = run(&mut replay);
-    assert!(error.is_none(), "{error:?}");
+    run_whole(&mut replay);
     assert!(replay.out_of_order() > 0);
     let mut all = memory.values();
     all.sort();
@@ -147,14 +143,12 @@ fn two_files_are_one_drive_and_equal_times_follow_the_order_of_the_files() {
     }
     let paths = [file(&drive(small_chunks(), &first)), file(&drive(small_chunks(), &second))];
     let both: Vec<Written> = first.iter().chain(&second).cloned().collect();
-    let (all, error) = replayed(&paths, &["/a", "/b", "/c"]);
-    assert!(error.is_none(), "{error:?}");
-    assert_eq!(all, expected(&both));
+    assert_eq!(delivered(&paths, &["/a", "/b", "/c"]), expected(&both));
     let mut replay = Replay::open(&paths).unwrap();
     let memory = listen(&mut replay, &["/a"]);
     assert_eq!(replay.progress().total, Some(200));
     run(&mut replay);
-    let writers: std::collections::BTreeSet<String> =
+    let writers: BTreeSet<String> =
         memory.0.lock().unwrap().iter().map(|(meta, _)| meta.writer.to_string()).collect();
     let expected_writers = ["6d636170000000000000000100000000", "6d636170000000010000000100000000"];
     assert!(writers.into_iter().eq(expected_writers));
@@ -190,8 +184,7 @@ fn two_subscriptions_of_one_topic_both_get_every_message() {
     let path = file(&drive(small_chunks(), &ticking(&["/a"], 50, 100)));
     let mut replay = Replay::open(&[path]).unwrap();
     let memory = listen(&mut replay, &["/a", "/a"]);
-    let (steps, error) = run(&mut replay);
-    assert!(error.is_none(), "{error:?}");
+    let steps = run_whole(&mut replay);
     assert_eq!(replay.progress(), Progress { done: 100, total: Some(100) });
     for (n, pair) in steps.chunks(2).enumerate() {
         assert_eq!([pair[0].subscription, pair[1].subscription], [0, 1].map(Subscription));
@@ -217,13 +210,10 @@ fn sequence_numbers_increase_even_if_the_recorder_did_not_count() {
 
 #[test]
 fn big_endian_messages_are_marked_as_such() {
-    let mut writer = small_chunks().create(Cursor::new(Vec::new())).unwrap();
-    let schema = writer.add_schema(TYPE, "ros2msg", b"int64 value").unwrap();
-    let channel_id = writer.add_channel(schema, "/a", "cdr", &BTreeMap::new()).unwrap();
-    let header = MessageHeader { channel_id, sequence: 0, log_time: 1, publish_time: 1 };
-    writer.write_to_known_channel(&header, &[0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 9]).unwrap();
-    writer.finish().unwrap();
-    let mut replay = Replay::open(&[file(&writer.into_inner().into_inner())]).unwrap();
+    let mut writer = begin();
+    let channel = add_channel(&mut writer, "/a", TEXT);
+    write_data(&mut writer, channel, 1, &[0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 9]);
+    let mut replay = Replay::open(&[file(&finish(writer))]).unwrap();
     let memory = listen(&mut replay, &["/a"]);
     run(&mut replay);
     let taken = memory.0.lock().unwrap();
@@ -234,7 +224,7 @@ fn big_endian_messages_are_marked_as_such() {
 
 #[test]
 fn foreign_encodings_matter_only_on_subscribed_topics() {
-    let mut writer = small_chunks().create(Cursor::new(Vec::new())).unwrap();
+    let mut writer = begin();
     let none = BTreeMap::new();
     let good = writer.add_schema(TYPE, "ros2msg", b"int64 value").unwrap();
     let idl = writer.add_schema(TYPE, "ros2idl", b"struct Number {};").unwrap();
@@ -246,8 +236,7 @@ fn foreign_encodings_matter_only_on_subscribed_topics() {
         write(&mut writer, channel, &message);
         write(&mut writer, json, &message);
     }
-    writer.finish().unwrap();
-    let path = file(&writer.into_inner().into_inner());
+    let path = file(&finish(writer));
     let mut replay = Replay::open(&[path]).unwrap();
     let memory = Arc::new(MemorySink::default());
     for (topic, text) in [
@@ -258,8 +247,7 @@ fn foreign_encodings_matter_only_on_subscribed_topics() {
         assert_eq!(refused.to_string(), text);
     }
     replay.subscribe(&spec("/good"), memory.clone()).unwrap();
-    let (steps, error) = run(&mut replay);
-    assert!(error.is_none(), "{error:?}");
+    let steps = run_whole(&mut replay);
     assert_eq!(steps.len(), 10);
 }
 
@@ -269,10 +257,8 @@ fn errors_name_the_topic_and_the_alternatives() {
     let mut replay = Replay::open(&[path]).unwrap();
     let memory = Arc::new(MemorySink::default());
     let absent = replay.subscribe(&spec("/camra"), memory.clone()).unwrap_err();
-    assert_eq!(
-        absent.to_string(),
-        "no topic `/camra` (did you mean `/camera`?); there are: /camera, /imu"
-    );
+    let expected = "no topic `/camra` (did you mean `/camera`?); there are: /camera, /imu";
+    assert_eq!(absent.to_string(), expected);
     let other = TopicSpec { type_name: "sensor_msgs/msg/Imu".to_owned(), ..spec("/imu") };
     let wrong = replay.subscribe(&other, memory.clone()).unwrap_err();
     assert!(matches!(wrong, TransportError::WrongType { .. }));
@@ -285,13 +271,11 @@ fn errors_name_the_topic_and_the_alternatives() {
 #[test]
 fn each_type_of_a_topic_is_read_alone() {
     let good = drive(small_chunks(), &ticking(&["/a"], 10, 100));
-    let mut writer = small_chunks().create(Cursor::new(Vec::new())).unwrap();
+    let mut writer = begin();
     let schema = writer.add_schema("test_msgs/msg/Other", "ros2msg", b"int8 x").unwrap();
-    let channel_id = writer.add_channel(schema, "/a", "cdr", &BTreeMap::new()).unwrap();
-    let header = MessageHeader { channel_id, sequence: 1, log_time: 105, publish_time: 0 };
-    writer.write_to_known_channel(&header, &[0, 1, 0, 0, 77]).unwrap();
-    writer.finish().unwrap();
-    let both = [file(&writer.into_inner().into_inner()), file(&good)];
+    let channel = writer.add_channel(schema, "/a", "cdr", &BTreeMap::new()).unwrap();
+    write_data(&mut writer, channel, 105, &[0, 1, 0, 0, 77]);
+    let both = [file(&finish(writer)), file(&good)];
     let mut replay = Replay::open(&both).unwrap();
     let topics = replay.topics();
     // That with the most messages comes first.
@@ -311,18 +295,15 @@ fn each_type_of_a_topic_is_read_alone() {
 /// Creates a drive with one channel of `/a` for each definition, which has one message of two bytes
 /// `n` and `10 + n`.
 fn drive_of_layouts(definitions: &[&str]) -> std::path::PathBuf {
-    let mut writer = small_chunks().create(Cursor::new(Vec::new())).unwrap();
+    let mut writer = begin();
     for (n, text) in definitions.iter().enumerate() {
         let schema = writer.add_schema(TYPE, "ros2msg", text.as_bytes()).unwrap();
         let metadata = [("n".to_owned(), n.to_string())].into();
-        let channel_id = writer.add_channel(schema, "/a", "cdr", &metadata).unwrap();
-        let n = n as u8;
-        let log_time = 100 + u64::from(n);
-        let header = MessageHeader { channel_id, sequence: 1, log_time, publish_time: 0 };
-        writer.write_to_known_channel(&header, &[0, 1, 0, 0, n, 10 + n]).unwrap();
+        let channel = writer.add_channel(schema, "/a", "cdr", &metadata).unwrap();
+        let (at, n) = (100 + n as u64, n as u8);
+        write_data(&mut writer, channel, at, &[0, 1, 0, 0, n, 10 + n]);
     }
-    writer.finish().unwrap();
-    file(&writer.into_inner().into_inner())
+    file(&finish(writer))
 }
 
 #[test]
@@ -355,8 +336,8 @@ fn each_message_is_read_by_the_layout_of_its_channel() {
 
 #[test]
 fn a_path_that_differs_between_layouts_is_refused_with_both() {
-    let drive =
-        drive_of_layouts(&["uint8 x\nuint8 y\n", "uint8 y\nstring x\n", "uint8 y\nuint8 z\n"]);
+    let layouts = ["uint8 x\nuint8 y\n", "uint8 y\nstring x\n", "uint8 y\nuint8 z\n"];
+    let drive = drive_of_layouts(&layouts);
     let definitions = Replay::open(&[drive]).unwrap().definitions("/a").unwrap();
     let refused = |path| FieldPath::compile(&definitions, path).unwrap_err().to_string();
     assert_eq!(
@@ -409,29 +390,72 @@ fn a_replay_can_move_to_another_thread() {
 }
 
 #[test]
-fn recordings_of_one_topic_that_overlap_are_refused_without_merge() {
-    const SECOND: u64 = 1_000_000_000;
-    let from = |topic, first| {
-        let mut messages = ticking(&[topic], 2, 0);
-        messages[0].at = first;
-        messages[1].at = first + 10 * SECOND;
-        file(&drive(small_chunks(), &messages))
-    };
-    let earlier = from("/a", SECOND);
-    let open = |other: &std::path::Path, merge| {
-        let options = DriveOptions { merge, ..DriveOptions::default() };
-        Replay::open_as(&[earlier.clone(), other.to_owned()], &options).map(drop)
-    };
-    // A recorder that goes on in another file writes some messages late.
-    for (topic, first, is_refused) in
-        [("/a", 3, true), ("/b", 3, false), ("/a", 10, false), ("/a", 12, false)]
-    {
-        let other = from(topic, first * SECOND);
-        let refused = open(&other, false).err();
-        assert_eq!(refused.is_some(), is_refused, "{topic} {first}: {refused:?}");
-        open(&other, true).unwrap();
+fn a_part_begins_with_the_latched_samples_that_were_valid() {
+    let mut writer = begin();
+    let schema = writer.add_schema(TYPE, "ros2msg", b"int64 value\n").unwrap();
+    let qos = "- depth: 1\n  durability: transient_local\n".to_owned();
+    let qos = [("offered_qos_profiles".to_owned(), qos)].into();
+    let map = writer.add_channel(schema, "/map", "cdr", &qos).unwrap();
+    let imu = add_channel(&mut writer, "/imu", TEXT);
+    // A recorder that does not number its messages.
+    for (value, channel) in [map, imu, map, imu, imu, map, imu].into_iter().enumerate() {
+        let (at, value) = (100 + 10 * value as u64, value as i64);
+        write(&mut writer, channel, &Written { topic: "", at, sequence: 0, value });
     }
-    let error = open(&from("/a", SECOND), false).unwrap_err();
-    assert!(error.to_string().ends_with("overlap in time, and both have topic `/a`"), "{error}");
-    assert!(error.help().unwrap().contains("--merge"));
+    let paths = [file(&finish(writer))];
+    let part = |from, latched: bool| {
+        let mut replay = Replay::open(&paths).unwrap();
+        replay.restrict(from, i64::MAX);
+        if latched {
+            replay.begin_with_latched(&paths, &DriveOptions::default());
+        }
+        let memory = listen(&mut replay, &["/imu", "/map"]);
+        let first = replay.peek_at_ns().unwrap();
+        assert!(run(&mut replay).1.is_none());
+        let taken = memory.0.lock().unwrap();
+        let times: Vec<_> = taken.iter().map(|(meta, _)| meta.publish_ns).collect();
+        let map = taken.iter().filter(|(_, cdr)| [0, 2, 5].contains(&cdr[0]));
+        let numbers: Vec<_> = map.map(|(meta, _)| (meta.at_ns, meta.seq)).collect();
+        (first, times, numbers)
+    };
+    let expected = (Some(135), vec![101, 121, 141, 151, 161], vec![(135, 1), (135, 2), (150, 3)]);
+    assert_eq!(part(135, true), expected);
+    assert_eq!(part(135, false), (Some(140), vec![141, 151, 161], vec![(150, 1)]));
+    assert_eq!(part(100, true).1, [101, 111, 121, 131, 141, 151, 161]);
+    assert_eq!(part(0, true).1.len(), 7);
+}
+
+#[test]
+fn a_definition_with_another_hash_than_the_channel_states_is_refused() {
+    // Published by ROS 2 for `std_msgs/msg/String`.
+    let hash = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18";
+    let string = "std_msgs/msg/String";
+    for (text, is_right) in [("# a text\nstring data", true), ("string data\nint8 more", false)] {
+        let mut writer = begin();
+        let schema = writer.add_schema(string, "ros2msg", text.as_bytes()).unwrap();
+        let stated = [("topic_type_hash".to_owned(), hash.to_owned())].into();
+        let channel = writer.add_channel(schema, "/a", "cdr", &stated).unwrap();
+        write(&mut writer, channel, &ticking(&["/a"], 1, 100)[0]);
+        let replay = Replay::open(&[file(&finish(writer))]).unwrap();
+        let spec = TopicSpec { type_name: string.to_owned(), ..spec("/a") };
+        match replay.can_subscribe(&spec) {
+            Ok(()) => assert!(is_right, "{text}"),
+            Err(refused) => assert!(!is_right && refused.to_string().contains("type hash")),
+        }
+    }
+}
+
+#[test]
+fn a_channel_without_messages_costs_its_topic_nothing() {
+    let mut writer = begin();
+    let idl = writer.add_schema(TYPE, "ros2idl", b"struct Number {};").unwrap();
+    writer.add_channel(idl, "/a", "json", &BTreeMap::new()).unwrap();
+    add_channel(&mut writer, "/a", "string value\n");
+    let channel = add_channel(&mut writer, "/a", TEXT);
+    write(&mut writer, channel, &ticking(&["/a"], 1, 100)[0]);
+    let mut replay = Replay::open(&[file(&finish(writer))]).unwrap();
+    listen(&mut replay, &["/a"]);
+    assert_eq!(run(&mut replay).0.len(), 1);
+    FieldPath::compile(&replay.definitions("/a").unwrap(), "value").unwrap();
+    assert!(replay.topics()[0].other_definitions.is_empty());
 }

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 
-use gleaner_drives::{Replay, ReplayError, ReplayStep};
+use gleaner_drives::{Damage, DamageLocation, Replay, ReplayError, ReplayStep};
 use gleaner_messages::Endian;
 use gleaner_transport::{Delivery, SampleMeta, Sink, TopicSpec, Transport};
 use mcap::records::MessageHeader;
@@ -119,19 +119,39 @@ pub fn small_chunks() -> WriteOptions {
 /// Returns the bytes of a drive with `messages` in file order.
 pub fn drive(options: WriteOptions, messages: &[Written]) -> Vec<u8> {
     let mut writer = options.create(Cursor::new(Vec::new())).unwrap();
-    let schema = writer.add_schema(TYPE, "ros2msg", TEXT.as_bytes()).unwrap();
-    let mut channels = BTreeMap::new();
     for message in messages {
-        let channel = *channels.entry(message.topic).or_insert_with(|| {
-            writer.add_channel(schema, message.topic, "cdr", &BTreeMap::new()).unwrap()
-        });
+        let channel = add_channel(&mut writer, message.topic, TEXT);
         write(&mut writer, channel, message);
     }
+    finish(writer)
+}
+
+pub type DriveWriter = Writer<Cursor<Vec<u8>>>;
+
+/// Begins a drive of small chunks.
+pub fn begin() -> DriveWriter {
+    small_chunks().create(Cursor::new(Vec::new())).unwrap()
+}
+
+/// Returns the bytes of a drive.
+pub fn finish(mut writer: DriveWriter) -> Vec<u8> {
     writer.finish().unwrap();
     writer.into_inner().into_inner()
 }
 
-pub fn write(writer: &mut Writer<Cursor<Vec<u8>>>, channel_id: u16, message: &Written) {
+/// Returns the channel of a topic of type [`TYPE`], which the first call adds.
+pub fn add_channel(writer: &mut DriveWriter, topic: &str, definition: &str) -> u16 {
+    let schema = writer.add_schema(TYPE, "ros2msg", definition.as_bytes()).unwrap();
+    writer.add_channel(schema, topic, "cdr", &BTreeMap::new()).unwrap()
+}
+
+/// Writes a message with these bytes, without a number.
+pub fn write_data(writer: &mut DriveWriter, channel_id: u16, log_time: u64, data: &[u8]) {
+    let header = MessageHeader { channel_id, sequence: 0, log_time, publish_time: log_time };
+    writer.write_to_known_channel(&header, data).unwrap();
+}
+
+pub fn write(writer: &mut DriveWriter, channel_id: u16, message: &Written) {
     let header = MessageHeader {
         channel_id,
         sequence: message.sequence,
@@ -146,6 +166,18 @@ pub fn write(writer: &mut Writer<Cursor<Vec<u8>>>, channel_id: u16, message: &Wr
 /// Encodes a record, for those that no correct writer writes.
 pub fn record(opcode: u8, body: &[u8]) -> Vec<u8> {
     [&[opcode][..], &(body.len() as u64).to_le_bytes(), body].concat()
+}
+
+pub const MAGIC: &[u8; 8] = b"\x89MCAP0\r\n";
+
+/// Encodes a text of a record.
+pub fn text(text: &str) -> Vec<u8> {
+    [&(text.len() as u32).to_le_bytes()[..], text.as_bytes()].concat()
+}
+
+/// Returns a finished file of these records, without a summary.
+pub fn finished(records: &[Vec<u8>]) -> Vec<u8> {
+    [&MAGIC[..], &records.concat(), &record(15, &[0; 4]), &record(2, &[0; 20]), MAGIC].concat()
 }
 
 /// Writes `bytes` to a new file.
@@ -201,6 +233,31 @@ pub fn run(replay: &mut Replay) -> (Vec<ReplayStep>, Option<ReplayError>) {
             Err(error) => return (steps, Some(error)),
         }
     }
+}
+
+/// Steps to the end.
+#[track_caller]
+pub fn run_whole(replay: &mut Replay) -> Vec<ReplayStep> {
+    let (steps, error) = run(replay);
+    assert!(error.is_none(), "{error:?}");
+    steps
+}
+
+/// Returns the damage that ended a replay, with its position.
+#[track_caller]
+pub fn damage(error: Option<ReplayError>) -> (u64, Damage) {
+    match error {
+        Some(ReplayError::Damaged { at: DamageLocation::Byte(offset), what, .. }) => (offset, what),
+        other => panic!("expected damage, got {other:?}"),
+    }
+}
+
+/// Replays undamaged drives of [`drive`]: returns the delivered (log time, value) pairs.
+#[track_caller]
+pub fn delivered(paths: &[PathBuf], topics: &[&str]) -> Vec<(i64, i64)> {
+    let (all, error) = replayed(paths, topics);
+    assert!(error.is_none(), "{error:?}");
+    all
 }
 
 /// Replays drives of [`drive`]: returns the delivered (log time, value) pairs, and the error.

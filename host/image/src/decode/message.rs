@@ -65,13 +65,13 @@ mod tests {
     #[test]
     fn the_format_of_a_message_must_name_what_its_bytes_hold() {
         let after = |file: &[u8]| [&[0; DEPTH_HEADER], file].concat();
-        let (depth, shallow) = (after(DEPTH), after(&INTERLACED));
+        let (depth, shallow) = (after(DEPTH), after(INTERLACED));
         for (format, data, why) in [
-            ("", &BASELINE[..], ""),
-            ("jpeg", &INTERLACED, ""),
+            ("", BASELINE, ""),
+            ("jpeg", INTERLACED, ""),
             ("png", DEPTH, ""),
-            ("bayer_rggb8; jpeg compressed bgr8", &BASELINE, ""),
-            ("mono16; jpeg compressed mono8", &BASELINE, ""),
+            ("bayer_rggb8; jpeg compressed bgr8", BASELINE, ""),
+            ("mono16; jpeg compressed mono8", BASELINE, ""),
             ("16UC1; png compressed ", DEPTH, ""),
             ("16UC1; compressedDepth", &depth, ""),
             ("mono16; compressedDepth png", &depth, ""),
@@ -83,7 +83,7 @@ mod tests {
             ),
             (
                 "16UC1; jpeg compressed ",
-                &BASELINE,
+                BASELINE,
                 "16UC1 has 16 bits per value, and the JPEG has 8",
             ),
             ("16UC1; compressedDepth", &shallow, "16UC1 has 16 bits per value, and the PNG has 8"),

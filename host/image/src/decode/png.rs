@@ -139,19 +139,16 @@ mod tests {
     use crate::decode::tests::{NOT_SUPPORTED, assert_close, decoded, rgb8_header};
     use crate::decode::{decode_rgb8, probe};
 
+    static PALETTE: [u8; 9] = [1, 2, 3, 40, 50, 60, 255, 254, 253];
+
     /// Encodes a PNG of `WIDTH` x `HEIGHT` pixels.
-    fn png(
-        color: ColorType,
-        depth: BitDepth,
-        palette: Option<&'static [u8]>,
-        data: &[u8],
-    ) -> Vec<u8> {
+    fn png(color: ColorType, depth: BitDepth, data: &[u8]) -> Vec<u8> {
         let mut file = Vec::new();
         let mut encoder = Encoder::new(&mut file, WIDTH, HEIGHT);
         encoder.set_color(color);
         encoder.set_depth(depth);
-        if let Some(palette) = palette {
-            encoder.set_palette(palette);
+        if color == ColorType::Indexed {
+            encoder.set_palette(&PALETTE[..]);
         }
         let mut writer = encoder.write_header().unwrap();
         writer.write_image_data(data).unwrap();
@@ -168,20 +165,16 @@ mod tests {
     fn a_png_of_any_kind_of_8_bits_becomes_rgb8() {
         use BitDepth::{Eight, Four, One};
         let full = |value: u8| [value, 0x55];
+        let rgba = |x, y| {
+            let [r, g, b] = colour(x, y);
+            [r, g, b, x as u8]
+        };
         let red = |x, y| colour(x, y)[0];
         let grey = |x, y| [red(x, y); 3];
         type Expected<'a> = &'a dyn Fn(usize, usize) -> [u8; 3];
         let cases: [(ColorType, BitDepth, Vec<u8>, Expected<'_>); 6] = [
             (ColorType::Rgb, Eight, pixels(colour), &colour),
-            (
-                ColorType::Rgba,
-                Eight,
-                pixels(|x, y| {
-                    let [r, g, b] = colour(x, y);
-                    [r, g, b, x as u8]
-                }),
-                &colour,
-            ),
+            (ColorType::Rgba, Eight, pixels(rgba), &colour),
             (ColorType::Grayscale, Eight, pixels(|x, y| [red(x, y)]), &grey),
             (ColorType::GrayscaleAlpha, Eight, pixels(|x, y| full(red(x, y))), &grey),
             // 0101… and 0 to 15, 0 to 15: eight and two pixels per byte.
@@ -191,7 +184,7 @@ mod tests {
             }),
         ];
         for (color, depth, data, expected) in cases {
-            let file = png(color, depth, None, &data);
+            let file = png(color, depth, &data);
             assert_eq!(probe(&file).unwrap(), rgb8_header(Format::Png));
             assert_close(&decoded(&file).unwrap(), 0, expected);
         }
@@ -212,7 +205,7 @@ mod tests {
         {
             let data = vec![7; bytes * (WIDTH * HEIGHT) as usize];
             assert_eq!(
-                probe(&png(color, BitDepth::Sixteen, None, &data)).unwrap_err().to_string(),
+                probe(&png(color, BitDepth::Sixteen, &data)).unwrap_err().to_string(),
                 format!("PNG is of 16 bits per value with colour or alpha, {NOT_SUPPORTED}")
             );
         }
@@ -220,9 +213,8 @@ mod tests {
 
     #[test]
     fn a_png_with_a_palette_becomes_its_colours() {
-        static PALETTE: [u8; 9] = [1, 2, 3, 40, 50, 60, 255, 254, 253];
         let data = pixels(|x, y| [((x + y) % 3) as u8]);
-        let file = png(ColorType::Indexed, BitDepth::Eight, Some(&PALETTE), &data);
+        let file = png(ColorType::Indexed, BitDepth::Eight, &data);
         assert_close(&decoded(&file).unwrap(), 0, |x, y| {
             let at = (x + y) % 3 * 3;
             [PALETTE[at], PALETTE[at + 1], PALETTE[at + 2]]
@@ -231,14 +223,12 @@ mod tests {
 
     #[test]
     fn an_interlaced_png_is_decoded() {
-        assert_close(&decoded(&samples::INTERLACED).unwrap(), 0, colour);
+        assert_close(&decoded(samples::INTERLACED).unwrap(), 0, colour);
     }
 
     #[test]
     fn a_png_truncated_anywhere_is_refused() {
-        for file in
-            [&png(ColorType::Rgb, BitDepth::Eight, None, &pixels(colour)), &samples::INTERLACED[..]]
-        {
+        for file in [&png(ColorType::Rgb, BitDepth::Eight, &pixels(colour)), samples::INTERLACED] {
             for len in 0..file.len() {
                 let error = decoded(&file[..len]).unwrap_err();
                 let expected = if len < 8 { "NotAnImage" } else { "Truncated" };
@@ -249,7 +239,7 @@ mod tests {
 
     #[test]
     fn a_png_with_any_pixel_byte_changed_is_refused() {
-        let file = png(ColorType::Rgb, BitDepth::Eight, None, &pixels(colour));
+        let file = png(ColorType::Rgb, BitDepth::Eight, &pixels(colour));
         let start = file.windows(4).position(|name| name == b"IDAT").unwrap();
         for at in start + 4..file.len() {
             let mut changed = file.clone();
@@ -260,7 +250,7 @@ mod tests {
 
     #[test]
     fn a_png_bomb_is_refused_before_memory_is_touched() {
-        let mut bomb = png(ColorType::Rgb, BitDepth::Eight, None, &pixels(colour));
+        let mut bomb = png(ColorType::Rgb, BitDepth::Eight, &pixels(colour));
         bomb[16..24].copy_from_slice(&[0, 0, 0xff, 0xff, 0, 0, 0xff, 0xff]);
         let header = probe(&bomb).unwrap();
         let error = decode_rgb8(&bomb, &header, 1 << 20, &mut []).unwrap_err();

@@ -1,6 +1,9 @@
 //! Tests the results of whole, broken and hostile files.
 
-use super::samples::{self, HEIGHT, WIDTH, colour};
+use super::samples::{
+    BASELINE, CMYK, DEPTH_INTERLACED, GREY, HEIGHT, INTERLACED, PROGRESSIVE, STANDARD_SCAN, WIDTH,
+    colour,
+};
 use super::*;
 
 /// End of the error of a kind of file that is not decoded.
@@ -35,9 +38,7 @@ pub(super) fn rgb8_header(format: Format) -> ImageHeader {
 
 #[test]
 fn decoding_stops_when_its_caller_requests_it() {
-    for file in
-        [&samples::BASELINE[..], &samples::PROGRESSIVE, &samples::GREY, &samples::INTERLACED]
-    {
+    for file in [BASELINE, PROGRESSIVE, GREY, INTERLACED] {
         let header = probe(file).unwrap();
         let mut out = vec![0; header.rgb8_len().unwrap()];
         let mut decode = |may_go_on: &dyn Fn() -> bool| {
@@ -55,7 +56,7 @@ fn decoding_stops_when_its_caller_requests_it() {
 
 #[test]
 fn a_jpeg_decodes_to_the_encoded_colours() {
-    for file in [&samples::BASELINE[..], &samples::PROGRESSIVE] {
+    for file in [BASELINE, PROGRESSIVE] {
         let header = rgb8_header(Format::Jpeg);
         assert_eq!(probe(file).unwrap(), header);
         // Pillow decodes them with errors of up to 6, and differs from this decoder by up to 2.
@@ -65,20 +66,20 @@ fn a_jpeg_decodes_to_the_encoded_colours() {
 
 #[test]
 fn a_grey_jpeg_becomes_equal_red_green_and_blue() {
-    assert_close(&decoded(&samples::GREY).unwrap(), 2, |x, y| [colour(x, y)[0]; 3]);
+    assert_close(&decoded(GREY).unwrap(), 2, |x, y| [colour(x, y)[0]; 3]);
 }
 
 #[test]
 fn a_jpeg_for_print_is_refused() {
     assert_eq!(
-        probe(&samples::CMYK).unwrap_err().to_string(),
+        probe(CMYK).unwrap_err().to_string(),
         format!("JPEG is neither grey nor of three components (CMYK?), {NOT_SUPPORTED}")
     );
 }
 
 #[test]
 fn a_jpeg_truncated_anywhere_is_refused() {
-    for file in [&samples::BASELINE[..], &samples::PROGRESSIVE, &samples::GREY] {
+    for file in [BASELINE, PROGRESSIVE, GREY] {
         for len in 0..file.len() {
             let error = decoded(&file[..len]).unwrap_err();
             let expected = if len < 3 { "NotAnImage" } else { "Truncated" };
@@ -86,16 +87,16 @@ fn a_jpeg_truncated_anywhere_is_refused() {
         }
     }
     assert_eq!(
-        decoded(&samples::BASELINE[..300]).unwrap_err().to_string(),
+        decoded(&BASELINE[..300]).unwrap_err().to_string(),
         "JPEG is truncated: its 300 bytes end before the image does"
     );
 }
 
 #[test]
 fn bytes_after_the_end_of_a_jpeg_are_ignored() {
-    let mut padded = samples::BASELINE.to_vec();
+    let mut padded = BASELINE.to_vec();
     padded.extend([0; 100]);
-    assert_eq!(decoded(&padded).unwrap(), decoded(&samples::BASELINE).unwrap());
+    assert_eq!(decoded(&padded).unwrap(), decoded(BASELINE).unwrap());
 }
 
 /// Returns the position of the first marker `marker` of a JPEG.
@@ -113,7 +114,7 @@ fn patched(file: &[u8], marker: u8, replacement: &[u8]) -> Vec<u8> {
 
 #[test]
 fn a_bomb_is_refused_before_memory_is_touched() {
-    let bomb = patched(&samples::BASELINE, 0xc0, &[0, 17, 8, 0xff, 0xdc, 0xff, 0xdc]);
+    let bomb = patched(BASELINE, 0xc0, &[0, 17, 8, 0xff, 0xdc, 0xff, 0xdc]);
     let header = probe(&bomb).unwrap();
     assert_eq!(
         decode_rgb8(&bomb, &header, 8 << 20, &mut []).unwrap_err().to_string(),
@@ -124,7 +125,7 @@ fn a_bomb_is_refused_before_memory_is_touched() {
 #[test]
 fn a_bomb_for_the_decoder_itself_is_refused() {
     // Small as rgb8, but 32 rows of blocks high where the factors are 4.
-    let thin = patched(&samples::PROGRESSIVE, 0xc2, &[0, 17, 8, 0, 1, 0xff, 0xff, 3, 1, 0x44]);
+    let thin = patched(PROGRESSIVE, 0xc2, &[0, 17, 8, 0, 1, 0xff, 0xff, 3, 1, 0x44]);
     let header = probe(&thin).unwrap();
     let mut out = vec![0; header.rgb8_len().unwrap()];
     let message = decode_rgb8(&thin, &header, out.len(), &mut out).unwrap_err().to_string();
@@ -134,10 +135,10 @@ fn a_bomb_for_the_decoder_itself_is_refused() {
 
 #[test]
 fn a_limit_of_exactly_the_size_is_sufficient() {
-    let header = probe(&samples::BASELINE).unwrap();
+    let header = probe(BASELINE).unwrap();
     let len = header.rgb8_len().unwrap();
     let mut out = vec![0; len];
-    let mut decode = |max_bytes| decode_rgb8(&samples::BASELINE, &header, max_bytes, &mut out);
+    let mut decode = |max_bytes| decode_rgb8(BASELINE, &header, max_bytes, &mut out);
     assert!(decode(len).is_ok());
     assert_eq!(
         decode(len - 1).unwrap_err().to_string(),
@@ -147,14 +148,14 @@ fn a_limit_of_exactly_the_size_is_sufficient() {
 
 #[test]
 fn the_header_must_match_the_data_and_the_output_length_the_header() {
-    let header = probe(&samples::GREY).unwrap();
+    let header = probe(GREY).unwrap();
     let other = ImageHeader { width: 23, ..header };
     assert_eq!(
-        decode_rgb8(&samples::GREY, &other, 9_999, &mut [0; 1104]).unwrap_err().to_string(),
+        decode_rgb8(GREY, &other, 9_999, &mut [0; 1104]).unwrap_err().to_string(),
         "JPEG of 24x16 where a JPEG of 23x16 was expected"
     );
     assert_eq!(
-        decode_rgb8(&samples::GREY, &header, 9_999, &mut [0; 1151]).unwrap_err().to_string(),
+        decode_rgb8(GREY, &header, 9_999, &mut [0; 1151]).unwrap_err().to_string(),
         "decoding needs 1152 bytes; the output has 1151"
     );
 }
@@ -162,7 +163,7 @@ fn the_header_must_match_the_data_and_the_output_length_the_header() {
 #[test]
 fn kinds_of_jpeg_that_cameras_do_not_send_are_named() {
     for (marker, kind) in [(0xc3, "lossless"), (0xc5, "hierarchical"), (0xc9, "arithmetic-coded")] {
-        let mut file = samples::BASELINE.to_vec();
+        let mut file = BASELINE.to_vec();
         let at = first(&file, 0xc0);
         file[at + 1] = marker;
         assert_eq!(
@@ -170,9 +171,9 @@ fn kinds_of_jpeg_that_cameras_do_not_send_are_named() {
             format!("JPEG is {kind}, {NOT_SUPPORTED}")
         );
     }
-    let twelve = patched(&samples::BASELINE, 0xc0, &[0, 17, 12]);
+    let twelve = patched(BASELINE, 0xc0, &[0, 17, 12]);
     assert!(matches!(probe(&twelve), Err(ImageError::Unsupported { .. })));
-    let no_height = patched(&samples::BASELINE, 0xc0, &[0, 17, 8, 0, 0]);
+    let no_height = patched(BASELINE, 0xc0, &[0, 17, 8, 0, 0]);
     assert!(matches!(
         probe(&no_height),
         Err(ImageError::Pixels(PixelError::Size { width: 24, height: 0 }))
@@ -182,7 +183,7 @@ fn kinds_of_jpeg_that_cameras_do_not_send_are_named() {
 #[test]
 fn a_jpeg_with_endless_scans_is_refused() {
     // The scans of an image, repeated: cheap to send, expensive to decode.
-    for file in [&samples::BASELINE[..], &samples::PROGRESSIVE] {
+    for file in [BASELINE, PROGRESSIVE] {
         let (start, scans) = file[..file.len() - 2].split_at(first(file, 0xda));
         let mut endless = start.to_vec();
         for _ in 0..70 {
@@ -197,10 +198,10 @@ fn a_jpeg_with_endless_scans_is_refused() {
 
 #[test]
 fn a_jpeg_without_huffman_tables_has_the_pixels_of_the_one_with_them() {
-    let head = &samples::BASELINE[..first(&samples::BASELINE, 0xc4)];
-    let mjpeg = [head, &samples::STANDARD_SCAN].concat();
+    let head = &BASELINE[..first(BASELINE, 0xc4)];
+    let mjpeg = [head, STANDARD_SCAN].concat();
     let rgb = decoded(&mjpeg).unwrap();
-    assert_eq!(rgb, decoded(&samples::BASELINE).unwrap());
+    assert_eq!(rgb, decoded(BASELINE).unwrap());
     // Some pixels by Pillow, by their index.
     let pillow: [(usize, [u8; 3]); 5] = [
         (0, [81, 59, 194]),
@@ -218,7 +219,7 @@ fn a_jpeg_without_huffman_tables_has_the_pixels_of_the_one_with_them() {
 #[test]
 fn the_error_of_a_jpeg_carries_its_cause() {
     // Its first table becomes data of an application.
-    let mut file = samples::BASELINE.to_vec();
+    let mut file = BASELINE.to_vec();
     let at = first(&file, 0xc4);
     file[at + 1] = 0xef;
     assert_eq!(
@@ -230,7 +231,7 @@ fn the_error_of_a_jpeg_carries_its_cause() {
 
 #[test]
 fn a_jpeg_without_pixels_is_refused() {
-    let mut file = samples::BASELINE.to_vec();
+    let mut file = BASELINE.to_vec();
     file.truncate(first(&file, 0xda));
     file.extend([0xff, 0xd9]);
     let error = decoded(&file).unwrap_err().to_string();
@@ -239,14 +240,14 @@ fn a_jpeg_without_pixels_is_refused() {
 
 #[test]
 fn kinds_of_jpeg_that_the_decoder_decodes_wrong_are_refused() {
-    let one_of_three = patched(&samples::BASELINE, 0xda, &[0, 8, 1, 1, 0, 0, 63, 0]);
+    let one_of_three = patched(BASELINE, 0xda, &[0, 8, 1, 1, 0, 0, 63, 0]);
     assert_eq!(
         decoded(&one_of_three).unwrap_err().to_string(),
         format!("JPEG is sequential with components in scans of their own, {NOT_SUPPORTED}")
     );
     for factors in [[0x11, 0x21, 0x21], [0x21, 0x12, 0x12], [0x22, 0x11, 0x21], [0x33, 0x11, 0x11]]
     {
-        let mut file = samples::BASELINE.to_vec();
+        let mut file = BASELINE.to_vec();
         let parts = first(&file, 0xc0) + 10;
         for (part, factors) in file[parts..].chunks_mut(3).zip(factors) {
             part[1] = factors;
@@ -272,13 +273,7 @@ fn other_bytes_are_refused_by_their_start() {
 
 #[test]
 fn no_mutation_of_a_file_causes_a_panic() {
-    let files = [
-        samples::BASELINE.to_vec(),
-        samples::PROGRESSIVE.to_vec(),
-        samples::GREY.to_vec(),
-        samples::INTERLACED.to_vec(),
-        samples::DEPTH_INTERLACED.to_vec(),
-    ];
+    let files = [BASELINE, PROGRESSIVE, GREY, INTERLACED, DEPTH_INTERLACED];
     let mut state = 1_u32;
     let mut random = |below: usize| {
         state ^= state << 13;
@@ -287,7 +282,7 @@ fn no_mutation_of_a_file_causes_a_panic() {
         state as usize % below
     };
     for _ in 0..2_000 {
-        let mut file = files[random(files.len())].clone();
+        let mut file = files[random(files.len())].to_vec();
         for _ in 0..=random(4) {
             let at = random(file.len());
             file[at] = random(256) as u8;

@@ -189,7 +189,7 @@ mod tests {
         library: Option<&'static [ExecutionProvider]>,
         providers: &[&str],
         threads: u32,
-    ) -> Result<(String, String), String> {
+    ) -> String {
         let onnx_runtime =
             library.map(|works| FakeBackend { version: "onnxruntime 1.23.2", works });
         let backends = Backends::new(
@@ -199,26 +199,22 @@ mod tests {
         let providers: Vec<String> = providers.iter().map(|name| (*name).to_owned()).collect();
         let signature = ModelSignature::default();
         let none = EngineUse::None;
-        let loaded = backends.load(b"model".to_vec(), &providers, threads, &signature, none);
-        loaded.map(|it| (it.runtime, it.reason)).map_err(|error| error.to_string())
-    }
-
-    fn pair(runtime: &str, reason: &str) -> Result<(String, String), String> {
-        Ok((runtime.to_owned(), reason.to_owned()))
+        match backends.load(b"model".to_vec(), &providers, threads, &signature, none) {
+            Ok(chosen) => format!("{}: {}", chosen.runtime, chosen.reason),
+            Err(error) => format!("error: {error}"),
+        }
     }
 
     #[test]
     fn without_a_named_provider_the_library_is_used_if_there_is_one() {
         assert_eq!(
             chosen(None, &[], 1),
-            pair(
-                "rten 0.27.0, cpu, 1 thread",
-                "the manifest names no provider; there is no ONNX Runtime: no file"
-            )
+            "rten 0.27.0, cpu, 1 thread: the manifest names no provider; there is no ONNX Runtime: \
+             no file"
         );
         assert_eq!(
             chosen(Some(&[CPU]), &[], 2),
-            pair("onnxruntime 1.23.2, cpu, 2 threads", "the manifest names no provider")
+            "onnxruntime 1.23.2, cpu, 2 threads: the manifest names no provider"
         );
     }
 
@@ -227,18 +223,16 @@ mod tests {
         let all = ["tensorrt", "cuda", "cpu"];
         assert_eq!(
             chosen(Some(&[ExecutionProvider::Cuda, CPU]), &all, 1),
-            pair(
-                "onnxruntime 1.23.2, cuda, 1 thread",
-                "`tensorrt` failed: no tensorrt; `cuda` is the next provider in the manifest"
-            )
+            "onnxruntime 1.23.2, cuda, 1 thread: `tensorrt` failed: no tensorrt; `cuda` is the \
+             next provider in the manifest"
         );
-        let (runtime, reason) = chosen(None, &all, 1).unwrap();
-        assert_eq!(runtime, "rten 0.27.0, cpu, 1 thread");
-        assert!(reason.starts_with("`tensorrt` failed: there is no ONNX Runtime: no file;"));
+        let found = chosen(None, &all, 1);
+        let start = "rten 0.27.0, cpu, 1 thread: `tensorrt` failed: there is no ONNX Runtime: no \
+                     file;";
+        assert!(found.starts_with(start), "{found}");
         assert_eq!(
-            chosen(Some(&[CPU]), &["rten"], 1).unwrap(),
-            pair("rten 0.27.0, cpu, 1 thread", "`rten` is the first provider in the manifest")
-                .unwrap()
+            chosen(Some(&[CPU]), &["rten"], 1),
+            "rten 0.27.0, cpu, 1 thread: `rten` is the first provider in the manifest"
         );
     }
 
@@ -246,16 +240,15 @@ mod tests {
     fn a_provider_that_fails_is_never_replaced_silently() {
         assert_eq!(
             chosen(Some(&[CPU]), &["tensorrt", "cuda"], 1),
-            Err("`tensorrt` failed: no tensorrt; `cuda` failed: no cuda".to_owned())
+            "error: `tensorrt` failed: no tensorrt; `cuda` failed: no cuda"
         );
         assert_eq!(
             chosen(None, &["onnxruntime"], 1),
-            Err("`onnxruntime` failed: there is no ONNX Runtime: no file".to_owned())
+            "error: `onnxruntime` failed: there is no ONNX Runtime: no file"
         );
         assert_eq!(
             chosen(Some(&[CPU]), &["cpu", "gpu"], 1),
-            Err("provider `gpu` is unknown; known are cpu, cuda, tensorrt, rten and onnxruntime"
-                .to_owned())
+            "error: provider `gpu` is unknown; known are cpu, cuda, tensorrt, rten and onnxruntime"
         );
     }
 }

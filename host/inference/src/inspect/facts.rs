@@ -1,10 +1,18 @@
-//! Collects the nodes of a model, its subgraphs included, and what it declares about values.
+//! Collects the nodes of a model, its subgraphs included, and what it declares about values. All of
+//! them are checked.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 
-use super::graph::{attribute_field, graph_field, node_field, tensor_field};
+use super::graph::{
+    DROPOUT, attribute_field, check_depth, check_operator, check_type, check_value, function_field,
+    graph_field, is_in, node_field, random, tensor_field,
+};
 use super::signature::DeclaredValue;
-use super::wire::{NoMessage, WireField, WireFields, WireValue};
+use super::wire::{WireField, WireFields, WireValue};
+use super::{InspectError, entry_of};
+
+/// Value of `DATA_LOCATION` for data in the model itself.
+const DEFAULT_LOCATION: i64 = 0;
 
 /// Most steps from a value back to one whose rank is declared.
 const MAX_STEPS: usize = 32;
@@ -18,10 +26,6 @@ const SAME_TYPE: &str = "Abs Add Div Exp Expand Gather MatMul Mul Pow Reshape Sq
 
 /// Operators whose results are booleans.
 const CONDITIONS: &str = "And Equal Greater GreaterOrEqual IsInf IsNaN Less LessOrEqual Not Or Xor";
-
-fn is_in(list: &str, operator: &str) -> bool {
-    list.split(' ').any(|listed| listed == operator)
-}
 
 /// A node of a graph.
 #[derive(Default)]
@@ -56,6 +60,8 @@ pub(super) struct ValueFacts {
     pub(super) is_whole: bool,
     /// True for a constant with a NaN.
     has_nan: bool,
+    /// True for a constant with values of which all are false.
+    is_false: bool,
 }
 
 /// All nodes of a model, and its values by name.
@@ -100,6 +106,11 @@ impl<'a> OnnxNode<'a> {
         self.outputs.first().copied().unwrap_or_default()
     }
 
+    /// Returns the value that makes the node random if it is not false.
+    fn switch(&self) -> Option<&'a str> {
+        Some(self.input(2)).filter(|name| self.operator == DROPOUT && !name.is_empty())
+    }
+
     /// Returns the facts of a node that is a constant.
     fn constant(&self) -> Option<ValueFacts> {
         let [attribute] = &self.attributes[..] else { return None };
@@ -116,23 +127,35 @@ impl<'a> OnnxNode<'a> {
 }
 
 impl<'a> GraphFacts<'a> {
-    /// Collects the facts of a graph whose depth was checked.
-    pub(super) fn of(graph: &'a [u8], opset: i64) -> Result<GraphFacts<'a>, NoMessage> {
-        let mut facts = GraphFacts { opset, ..GraphFacts::default() };
-        facts.add(graph)?;
-        Ok(facts)
-    }
-
-    fn add(&mut self, graph: &'a [u8]) -> Result<(), NoMessage> {
+    /// Adds the facts of a graph and of its subgraphs.
+    ///
+    /// # Errors
+    ///
+    /// [`InspectError`] names the first operator, constant or type that is refused.
+    pub(super) fn add(&mut self, graph: &'a [u8], depth: usize) -> Result<(), InspectError> {
+        check_depth(depth)?;
+        let mut switches: HashSet<&str> = HashSet::new();
+        // Values of this graph: true for constants that are false.
+        let mut are_false: HashMap<&str, bool> = HashMap::new();
         for field in WireFields(graph) {
             let field = field?;
             match field.number {
-                graph_field::NODE => self.add_node(field.fields()?)?,
+                graph_field::NODE => {
+                    let node = self.add_node(field.fields()?, depth)?;
+                    switches.extend(node.switch());
+                    let is_false = node.constant().is_some_and(|it| it.is_false);
+                    for output in &node.outputs {
+                        *are_false.entry(output).or_insert(true) &= is_false;
+                    }
+                }
                 graph_field::INITIALIZER => {
                     let (name, facts) = tensor(field.fields()?)?;
+                    *are_false.entry(name).or_insert(true) &= facts.is_false;
                     self.declare(name, facts);
                 }
+                graph_field::SPARSE_INITIALIZER => check_sparse(field)?,
                 graph_field::INPUT | graph_field::OUTPUT | graph_field::VALUE_INFO => {
+                    check_value(field)?;
                     let declared = DeclaredValue::of(field)?;
                     if let Some(tensor) = declared.tensor {
                         let shape = tensor.shape.filter(|it| it.len() == tensor.dimensions);
@@ -144,7 +167,10 @@ impl<'a> GraphFacts<'a> {
                 _ => {}
             }
         }
-        Ok(())
+        match switches.iter().all(|name| are_false.get(name) == Some(&true)) {
+            true => Ok(()),
+            false => Err(random(DROPOUT)),
+        }
     }
 
     /// Notes the facts of a value. Of a value that is declared twice, constants count.
@@ -158,32 +184,43 @@ impl<'a> GraphFacts<'a> {
         known.shape = facts.shape.or(known.shape.take());
     }
 
-    fn add_node(&mut self, fields: WireFields<'a>) -> Result<(), NoMessage> {
-        let mut node = OnnxNode::default();
+    fn add_node(
+        &mut self,
+        fields: WireFields<'a>,
+        depth: usize,
+    ) -> Result<&OnnxNode<'a>, InspectError> {
+        let (mut node, mut domain) = (OnnxNode::default(), "");
         for field in fields {
             let field = field?;
             match field.number {
                 node_field::INPUT => node.inputs.push(field.text()?),
                 node_field::OUTPUT => node.outputs.push(field.text()?),
                 node_field::OPERATOR => node.operator = field.text()?,
+                node_field::DOMAIN => domain = field.text()?,
                 node_field::ATTRIBUTE => {
-                    let attribute = self.attribute(field.fields()?)?;
+                    let attribute = self.attribute(field.fields()?, depth)?;
                     node.attributes.push(attribute);
                 }
                 _ => {}
             }
         }
+        check_operator(domain, node.operator)?;
         if let Some(facts) = node.constant() {
             self.declare(node.output(), facts);
         }
+        let index = self.nodes.len();
         for output in &node.outputs {
-            self.producers.insert(output, self.nodes.len());
+            self.producers.insert(output, index);
         }
         self.nodes.push(node);
-        Ok(())
+        Ok(&self.nodes[index])
     }
 
-    fn attribute(&mut self, fields: WireFields<'a>) -> Result<NodeAttribute<'a>, NoMessage> {
+    fn attribute(
+        &mut self,
+        fields: WireFields<'a>,
+        depth: usize,
+    ) -> Result<NodeAttribute<'a>, InspectError> {
         let mut attribute = NodeAttribute::default();
         for field in fields {
             let field = field?;
@@ -193,10 +230,15 @@ impl<'a> GraphFacts<'a> {
                 // A text that is not UTF-8 is none that a rule compares with.
                 attribute_field::TEXT => attribute.text = field.text().unwrap_or_default(),
                 attribute_field::NUMBERS => field.numbers(&mut attribute.numbers)?,
-                attribute_field::TENSOR => {
-                    attribute.tensor = Some(tensor(field.fields()?)?.1);
+                attribute_field::TENSOR => attribute.tensor = Some(tensor(field.fields()?)?.1),
+                attribute_field::TENSORS => drop(tensor(field.fields()?)?),
+                attribute_field::GRAPH | attribute_field::GRAPHS => {
+                    self.add(field.bytes()?, depth + 1)?;
                 }
-                attribute_field::GRAPH | attribute_field::GRAPHS => self.add(field.bytes()?)?,
+                attribute_field::SPARSE_TENSOR | attribute_field::SPARSE_TENSORS => {
+                    check_sparse(field)?;
+                }
+                attribute_field::TYPE | attribute_field::TYPES => check_type(field, 0)?,
                 _ => {}
             }
         }
@@ -259,25 +301,69 @@ impl<'a> GraphFacts<'a> {
     }
 }
 
+/// Checks a function of the model, which is a graph without constants.
+pub(super) fn check_function(function: &[u8]) -> Result<(), InspectError> {
+    let mut facts = GraphFacts::default();
+    for field in WireFields(function) {
+        let field = field?;
+        match field.number {
+            // The caller of a function gives the value.
+            function_field::NODE if facts.add_node(field.fields()?, 0)?.switch().is_some() => {
+                return Err(random(DROPOUT));
+            }
+            function_field::ATTRIBUTE => drop(facts.attribute(field.fields()?, 0)?),
+            _ => {}
+        }
+    }
+    Ok(())
+}
+
+/// Checks a tensor with few values other than 0: two tensors, of values and of their places.
+fn check_sparse(sparse: WireField<'_>) -> Result<(), InspectError> {
+    sparse.fields()?.of(&[1, 2]).try_for_each(|field| tensor(field?.fields()?).map(drop))
+}
+
 fn is_wide(number: i64) -> bool {
     i32::try_from(number).is_err()
 }
 
 /// Returns name and facts of a constant.
-fn tensor(fields: WireFields<'_>) -> Result<(&str, ValueFacts), NoMessage> {
+fn tensor(fields: WireFields<'_>) -> Result<(&str, ValueFacts), InspectError> {
     let (mut name, mut element, mut shape) = ("", None, Vec::new());
     let (mut raw, mut integers, mut has_nan) = (&[][..], Vec::new(), false);
+    let (mut is_false, mut location, mut is_external) = (None, "", false);
     for field in fields {
         let field = field?;
         match field.number {
             tensor_field::DIMS => field.numbers(&mut shape)?,
             tensor_field::DATA_TYPE => element = Some(field.number()?),
             tensor_field::NAME => name = field.text()?,
-            tensor_field::RAW_DATA => raw = field.bytes()?,
+            tensor_field::RAW_DATA | tensor_field::INT32_DATA => {
+                let is_zero = match field.value {
+                    WireValue::Varint(value) => value == 0,
+                    WireValue::Bytes(bytes) => bytes.iter().all(|byte| *byte == 0),
+                    WireValue::Fixed => false,
+                };
+                is_false = Some(is_zero && is_false != Some(false));
+                if field.number == tensor_field::RAW_DATA {
+                    raw = field.bytes()?;
+                }
+            }
             tensor_field::INT64_DATA => field.numbers(&mut integers)?,
             tensor_field::FLOAT_DATA => has_nan |= packed_nan(field),
+            tensor_field::DATA_LOCATION => is_external |= field.number()? != DEFAULT_LOCATION,
+            tensor_field::EXTERNAL_DATA => {
+                is_external = true;
+                let (key, value) = entry_of(field.fields()?)?;
+                let value = value.map_or(Ok(""), |it| it.text())?;
+                location = if key == "location" { value } else { location };
+            }
             _ => {}
         }
+    }
+    if is_external {
+        let (tensor, location) = (name.to_owned(), location.to_owned());
+        return Err(InspectError::ExternalData { tensor, location });
     }
     let wide = |bytes: &[u8]| bytes.try_into().is_ok_and(|it| is_wide(i64::from_le_bytes(it)));
     let is_wide = integers.into_iter().any(is_wide)
@@ -287,7 +373,8 @@ fn tensor(fields: WireFields<'_>) -> Result<(&str, ValueFacts), NoMessage> {
         && (1..=SMALL).contains(&raw.len())
         && raw.chunks_exact(4).all(|it| float(it).fract() == 0.0);
     let shape = Some(shape);
-    Ok((name, ValueFacts { element, shape, is_wide, is_constant: true, is_whole, has_nan }))
+    let (is_constant, is_false) = (true, is_false == Some(true));
+    Ok((name, ValueFacts { element, shape, is_wide, is_constant, is_whole, has_nan, is_false }))
 }
 
 fn float(bytes: &[u8]) -> f32 {

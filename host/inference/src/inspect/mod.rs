@@ -1,9 +1,10 @@
 //! Checks a model before a library parses it, and reads its inputs and outputs.
 //!
 //! - `wire`: fields of protobuf messages.
-//! - `graph`: graphs, nodes and attributes: operators, data in other files, depth.
+//! - `graph`: fields of graphs, operators, types and depth.
 //! - `signature`: inputs and outputs.
-//! - `facts`: nodes, and what is declared of values. `rten_rules`: what rten computes wrongly.
+//! - `facts`: nodes, constants and what is declared of values, with their checks.
+//! - `rten_rules`: results of rten that are wrong.
 //!
 //! These are own checks: the types of `rten-onnx` copy all weights, take memory for a length before
 //! they compare it with the file, follow subgraphs to any depth, and have no functions and no
@@ -19,9 +20,8 @@ mod wire;
 
 use gleaner_protocol::inference::Element;
 
-use facts::GraphFacts;
-use graph::{check_functions, check_graph};
-use wire::{NoMessage, WireFields};
+use facts::{GraphFacts, check_function};
+use wire::{NoMessage, WireField, WireFields};
 
 pub use rten_rules::{RTEN_RULES, RtenFinding, RtenRule, RtenRuleKind};
 pub use signature::{ModelSignature, OutputInfo};
@@ -96,7 +96,7 @@ impl From<NoMessage> for InspectError {
 }
 
 fn elements() -> String {
-    signature::ELEMENTS.map(|(_, element): (i64, Element)| element.name()).join(", ")
+    Element::ALL.map(Element::name).join(", ")
 }
 
 /// Checks the file of a model, and returns its inputs and outputs.
@@ -115,13 +115,16 @@ pub fn inspect(model: &[u8]) -> Result<ModelSignature, InspectError> {
             // Libraries would disagree on which of two counts.
             model_field::GRAPH => return Err(InspectError::NoModel),
             model_field::OPSET => {
-                let (domain, version) = opset_of(field.fields()?)?;
+                let (domain, version) = entry_of(field.fields()?)?;
+                let version = version.map_or(Ok(0), |it| it.number())?;
                 if graph::is_standard(domain) {
                     opset = Some(version);
                 }
             }
             model_field::METADATA => {
                 let (key, value) = entry_of(field.fields()?)?;
+                // Only the values of known keys are read.
+                let value = value.and_then(|it| it.text().ok()).unwrap_or_default();
                 let is_plain = !value.contains(char::is_control);
                 let is_read = is_plain && METADATA.contains(&key);
                 metadata_bytes += if is_read { value.len() } else { 0 };
@@ -131,48 +134,35 @@ pub fn inspect(model: &[u8]) -> Result<ModelSignature, InspectError> {
             }
             model_field::FUNCTIONS => {
                 has_functions = true;
-                check_functions(field.bytes()?)?;
+                check_function(field.bytes()?)?;
             }
             _ => {}
         }
     }
     let graph = graph.filter(|_| has_version).ok_or(InspectError::NoModel)?;
-    check_graph(graph, 0)?;
+    let mut facts = GraphFacts::default();
+    facts.add(graph, 0)?;
     // After the operators: a model of foreign ones only may import no others.
-    let opset = match opset {
+    facts.opset = match opset {
         Some(version @ OLDEST_OPSET..=NEWEST_OPSET) => version,
         Some(version) => return Err(InspectError::Opset { version }),
         None => return Err(InspectError::NoOpset),
     };
     let signature = ModelSignature::of(graph)?;
-    let rten = rten_rules::findings(&GraphFacts::of(graph, opset)?, has_functions);
+    let rten = rten_rules::findings(&facts, has_functions);
     Ok(ModelSignature { rten, metadata, ..signature })
 }
 
-/// Returns key and value of an entry of the metadata.
-fn entry_of(fields: WireFields<'_>) -> Result<(&str, &str), NoMessage> {
-    let (mut key, mut value) = ("", "");
+/// Returns the key of an entry, and the field with its value.
+fn entry_of(fields: WireFields<'_>) -> Result<(&str, Option<WireField<'_>>), NoMessage> {
+    let (mut key, mut value) = ("", None);
     for field in fields {
         let field = field?;
         match field.number {
             1 => key = field.text()?,
-            // Only the values of known keys are read.
-            2 => value = field.text().unwrap_or_default(),
+            2 => value = Some(field),
             _ => {}
         }
     }
     Ok((key, value))
-}
-
-fn opset_of(fields: WireFields<'_>) -> Result<(&str, i64), NoMessage> {
-    let (mut domain, mut version) = ("", 0);
-    for field in fields {
-        let field = field?;
-        match field.number {
-            1 => domain = field.text()?,
-            2 => version = field.number()?,
-            _ => {}
-        }
-    }
-    Ok((domain, version))
 }

@@ -21,8 +21,10 @@ pub struct RtenRule {
     pub computes: &'static str,
     /// The models or runs that are refused.
     pub kind: RtenRuleKind,
-    applies: fn(&OnnxNode<'_>, &GraphFacts<'_>) -> bool,
+    applies: RuleCondition,
 }
+
+type RuleCondition = fn(&OnnxNode<'_>, &GraphFacts<'_>) -> bool;
 
 /// The models or runs that a rule refuses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -36,7 +38,7 @@ pub enum RtenRuleKind {
 }
 
 /// A rule that holds for a node of a model.
-#[derive(Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RtenFinding {
     /// The models or runs that are refused.
     pub kind: RtenRuleKind,
@@ -44,104 +46,80 @@ pub struct RtenFinding {
     pub message: String,
 }
 
-impl std::fmt::Debug for RtenFinding {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(&self.message)
-    }
+/// A rule that refuses models with a node to which a condition applies.
+const fn rule(
+    operators: &'static [&'static str],
+    when: &'static str,
+    computes: &'static str,
+    applies: RuleCondition,
+) -> RtenRule {
+    RtenRule { operators, when, computes, kind: RtenRuleKind::Model, applies }
+}
+
+/// A rule that refuses models with one of these operators.
+const fn always(operators: &'static [&'static str], computes: &'static str) -> RtenRule {
+    rule(operators, "always", computes, |_, _| true)
 }
 
 /// All rules.
 pub const RTEN_RULES: &[RtenRule] = &[
-    RtenRule {
-        operators: &["NonMaxSuppression"],
-        when: "always",
-        computes: "boxes of all classes and images suppress each other, and so do boxes that were \
-                   themselves suppressed",
-        kind: RtenRuleKind::Model,
-        applies: |_, _| true,
-    },
-    RtenRule {
-        operators: &["Resize"],
-        when: "`mode` is `cubic`",
-        computes: "a linear interpolation",
-        kind: RtenRuleKind::Model,
-        applies: |node, _| node.text("mode") == "cubic",
-    },
-    RtenRule {
-        operators: &["Resize"],
-        when: "`align_corners`, with scales that are not constant whole numbers",
-        computes: "with the rounded length in place of the exact one",
-        kind: RtenRuleKind::Model,
-        applies: |node, facts| {
+    always(
+        &["NonMaxSuppression"],
+        "boxes of all classes and images suppress each other, and so do boxes that were \
+         themselves suppressed",
+    ),
+    rule(&["Resize"], "`mode` is `cubic`", "a linear interpolation", |node, _| {
+        node.text("mode") == "cubic"
+    }),
+    rule(
+        &["Resize"],
+        "`align_corners`, with scales that are not constant whole numbers",
+        "with the rounded length in place of the exact one",
+        |node, facts| {
             let scales = node.input(2);
             let is_whole = facts.value(scales).is_some_and(|it| it.is_whole);
             node.text("coordinate_transformation_mode") == "align_corners"
                 && !scales.is_empty()
                 && !is_whole
         },
-    },
-    RtenRule {
-        operators: &["Softmax", "LogSoftmax"],
-        when: "the opset is below 13, and `axis` is not known to be the last",
-        computes: "a distribution along `axis` in place of one over all axes from it on",
-        kind: RtenRuleKind::Model,
-        applies: normalises_more_than_one_axis,
-    },
-    RtenRule {
-        operators: &["ArgMax", "ArgMin"],
-        when: "always",
-        computes: "the last of equal values in place of the first",
-        kind: RtenRuleKind::Model,
-        applies: |_, _| true,
-    },
-    RtenRule {
-        operators: &["Conv", "ConvInteger", "ConvTranspose", "MaxPool", "AveragePool"],
-        when: "`auto_pad` is `SAME_LOWER`, unless strides are 1 and kernels odd",
-        computes: "the padding of `SAME_UPPER`",
-        kind: RtenRuleKind::Model,
-        applies: |node, _| {
+    ),
+    rule(
+        &["Softmax", "LogSoftmax"],
+        "the opset is below 13, and `axis` is not known to be the last",
+        "a distribution along `axis` in place of one over all axes from it on",
+        normalises_more_than_one_axis,
+    ),
+    always(&["ArgMax", "ArgMin"], "the last of equal values in place of the first"),
+    rule(
+        &["Conv", "ConvInteger", "ConvTranspose", "MaxPool", "AveragePool"],
+        "`auto_pad` is `SAME_LOWER`, unless strides are 1 and kernels odd",
+        "the padding of `SAME_UPPER`",
+        |node, _| {
             let kernel = node.numbers("kernel_shape");
             let is_even = node.numbers("strides").iter().all(|stride| *stride == 1)
                 && !kernel.is_empty()
                 && kernel.iter().all(|length| length % 2 == 1);
             node.text("auto_pad") == "SAME_LOWER" && !is_even
         },
-    },
-    RtenRule {
-        operators: &["DynamicQuantizeLinear"],
-        when: "always",
-        computes: "a scale that is off by one unit in the last place, and with it other steps",
-        kind: RtenRuleKind::Model,
-        applies: |_, _| true,
-    },
-    RtenRule {
-        operators: &["QuantizeLinear"],
-        when: "the scale is not constant",
-        computes: "another step for values between two, as the scale is off in the last place",
-        kind: RtenRuleKind::Model,
-        applies: |node, facts| !facts.value(node.input(1)).is_some_and(|it| it.is_constant),
-    },
-    RtenRule {
-        operators: &["Softplus"],
-        when: "always",
-        computes: "infinity for numbers above 88",
-        kind: RtenRuleKind::Model,
-        applies: |_, _| true,
-    },
-    RtenRule {
-        operators: &["SequenceInsert"],
-        when: "with a position",
-        computes: "the place behind that of a negative position",
-        kind: RtenRuleKind::Model,
-        applies: |node, _| !node.input(2).is_empty(),
-    },
-    RtenRule {
-        operators: &["ConvInteger"],
-        when: "always",
-        computes: "a padding of 0 in place of the zero point",
-        kind: RtenRuleKind::Model,
-        applies: |_, _| true,
-    },
+    ),
+    always(
+        &["DynamicQuantizeLinear"],
+        "a scale that is off by one unit in the last place, and with it other steps",
+    ),
+    rule(
+        &["QuantizeLinear"],
+        "the scale is not constant",
+        "another step for values between two, as the scale is off in the last place",
+        |node, facts| !facts.value(node.input(1)).is_some_and(|it| it.is_constant),
+    ),
+    always(&["Softplus"], "infinity for numbers above 88"),
+    rule(
+        &["SequenceInsert"],
+        "with a position",
+        "the place behind that of a negative position",
+        |node, _| !node.input(2).is_empty(),
+    ),
+    always(&["ConvInteger"], "a padding of 0 in place of the zero point"),
     RtenRule {
         operators: &["MatMulInteger"],
         when: "on x86-64 processors without VNNI",
@@ -149,51 +127,41 @@ pub const RTEN_RULES: &[RtenRule] = &[
         kind: RtenRuleKind::Processor,
         applies: |_, _| true,
     },
-    RtenRule {
-        operators: &["MatMul", "MatMulInteger"],
-        when: "the second input has one dimension, and the first is not known to have at most two",
-        computes: "a result with a dimension too many",
-        kind: RtenRuleKind::Model,
-        applies: |node, facts| {
+    rule(
+        &["MatMul", "MatMulInteger"],
+        "the second input has one dimension, and the first is not known to have at most two",
+        "a result with a dimension too many",
+        |node, facts| {
             let ranks = [0, 1].map(|input| facts.rank(node.input(input)));
             ranks[1] == Some(1) && ranks[0].is_none_or(|rank| rank > 2)
         },
-    },
-    RtenRule {
-        operators: &["Sign"],
-        when: "the input is not known to have integers",
-        computes: "1 for 0",
-        kind: RtenRuleKind::Model,
-        applies: |node, facts| {
-            !facts.element(node.input(0)).is_some_and(|it| INTEGERS.contains(&it))
-        },
-    },
-    RtenRule {
-        operators: &["Cast"],
-        when: "to boolean, from an input that is not known to be boolean",
-        computes: "false for fractions, and numbers other than 0 and 1",
-        kind: RtenRuleKind::Model,
-        applies: |node, facts| {
+    ),
+    rule(&["Sign"], "the input is not known to have integers", "1 for 0", |node, facts| {
+        !facts.element(node.input(0)).is_some_and(|it| INTEGERS.contains(&it))
+    }),
+    rule(
+        &["Cast"],
+        "to boolean, from an input that is not known to be boolean",
+        "false for fractions, and numbers other than 0 and 1",
+        |node, facts| {
             node.number("to") == Some(BOOLEAN) && facts.element(node.input(0)) != Some(BOOLEAN)
         },
-    },
-    RtenRule {
-        operators: &["CastLike"],
-        when: "the second input is boolean, or of an unknown type",
-        computes: "false for fractions, and numbers other than 0 and 1",
-        kind: RtenRuleKind::Model,
-        applies: |node, facts| facts.element(node.input(1)).is_none_or(|it| it == BOOLEAN),
-    },
-    RtenRule {
-        operators: &[],
-        when: "a constant exceeds 32 bits, but for the bounds of `Slice`",
-        computes: "the largest number of 32 bits in its place",
-        kind: RtenRuleKind::Model,
-        applies: |node, facts| {
+    ),
+    rule(
+        &["CastLike"],
+        "the second input is boolean, or of an unknown type",
+        "false for fractions, and numbers other than 0 and 1",
+        |node, facts| facts.element(node.input(1)).is_none_or(|it| it == BOOLEAN),
+    ),
+    rule(
+        &[],
+        "a constant exceeds 32 bits, but for the bounds of `Slice`",
+        "the largest number of 32 bits in its place",
+        |node, facts| {
             let is_wide = |name: &&str| facts.value(name).is_some_and(|it| it.is_wide);
             node.operator != "Slice" && node.inputs.iter().any(is_wide)
         },
-    },
+    ),
     RtenRule {
         operators: &["Relu", "Clip"],
         when: "a constant or an input of a run has a NaN",

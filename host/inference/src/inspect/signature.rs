@@ -4,34 +4,14 @@ use std::collections::HashSet;
 
 use gleaner_protocol::inference::{Element, MAX_DIMENSIONS, TensorInfo};
 
-use super::graph::graph_field;
+use super::graph::{graph_field, tensor_field};
 use super::rten_rules::RtenFinding;
 use super::wire::{NoMessage, WireField, WireFields};
 use super::{InspectError, MAX_TENSORS};
 
-/// Types of elements by their number in ONNX.
-pub(super) const ELEMENTS: [(i64, Element); 9] = [
-    (1, Element::Float32),
-    (10, Element::Float16),
-    (11, Element::Float64),
-    (3, Element::Int8),
-    (5, Element::Int16),
-    (6, Element::Int32),
-    (7, Element::Int64),
-    (2, Element::Uint8),
-    (9, Element::Boolean),
-];
-
-/// Names of the other types, for messages.
-const OTHERS: [(i64, &str); 7] = [
-    (4, "uint16"),
-    (8, "string"),
-    (12, "uint32"),
-    (13, "uint64"),
-    (14, "complex64"),
-    (15, "complex128"),
-    (16, "bfloat16"),
-];
+/// Names of the types of elements, in the order of their numbers in ONNX, which begin with 1.
+const ELEMENTS: &str = "float32 uint8 int8 uint16 int16 int32 int64 string boolean \
+                        float16 float64 uint32 uint64 complex64 complex128 bfloat16";
 
 /// The inputs and outputs of a model, as its file declares them.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -76,13 +56,9 @@ impl ModelSignature {
     /// Reads the inputs and outputs of a graph.
     pub(super) fn of(graph: &[u8]) -> Result<ModelSignature, InspectError> {
         // Constants first: older models declare each as an input, too.
-        let mut constants = HashSet::new();
-        for field in WireFields(graph) {
-            let field = field?;
-            if field.number == graph_field::INITIALIZER {
-                constants.insert(name_of_tensor(field)?);
-            }
-        }
+        let constants = WireFields(graph).of(&[graph_field::INITIALIZER]);
+        let constants: HashSet<&str> =
+            constants.map(|tensor| name_of_tensor(tensor?)).collect::<Result<_, _>>()?;
         let (mut inputs, mut outputs) = (Vec::new(), Vec::new());
         for field in WireFields(graph) {
             let field = field?;
@@ -132,14 +108,7 @@ fn undeclared(what: &'static str, name: &str, lacks: &'static str) -> InspectErr
 }
 
 fn name_of_tensor<'a>(tensor: WireField<'a>) -> Result<&'a str, NoMessage> {
-    let mut name = "";
-    for field in tensor.fields()? {
-        let field = field?;
-        if field.number == 8 {
-            name = field.text()?;
-        }
-    }
-    Ok(name)
+    tensor.fields()?.of(&[tensor_field::NAME]).try_fold("", |_, name| name?.text())
 }
 
 impl<'a> DeclaredValue<'a> {
@@ -176,9 +145,11 @@ impl<'a> DeclaredValue<'a> {
         let lacks = |lacks| undeclared(what, self.name, lacks);
         let tensor = self.tensor.as_ref().ok_or_else(|| lacks("type"))?;
         let number = tensor.element.ok_or_else(|| lacks("type"))?;
-        let Some((_, element)) = ELEMENTS.into_iter().find(|(known, _)| *known == number) else {
-            let found = OTHERS.iter().find(|(known, _)| *known == number);
-            let found = found.map_or_else(|| number.to_string(), |(_, name)| (*name).to_owned());
+        let mut elements = (1..).zip(ELEMENTS.split(' '));
+        let found = elements.find(|(known, _)| *known == number).map(|(_, name)| name);
+        let is_it = |element: &Element| found == Some(element.name());
+        let Some(element) = Element::ALL.into_iter().find(is_it) else {
+            let found = found.map_or_else(|| number.to_string(), str::to_owned);
             return Err(InspectError::Element { what, name: name(), found });
         };
         let lengths = tensor.shape.as_deref().unwrap_or_default();
@@ -211,14 +182,11 @@ impl DeclaredTensor {
                 1 => declared.element = Some(field.number()?),
                 2 => {
                     let shape = declared.shape.get_or_insert_default();
-                    for field in field.fields()? {
-                        let field = field?;
-                        if field.number == 1 {
-                            let length = length_of(field.fields()?)?;
-                            declared.dimensions += 1;
-                            if declared.dimensions <= MAX_DIMENSIONS {
-                                shape.push(length);
-                            }
+                    for dimension in field.fields()?.of(&[1]) {
+                        let length = length_of(dimension?.fields()?)?;
+                        declared.dimensions += 1;
+                        if declared.dimensions <= MAX_DIMENSIONS {
+                            shape.push(length);
                         }
                     }
                 }

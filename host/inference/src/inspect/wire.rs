@@ -67,6 +67,16 @@ impl<'a> WireField<'a> {
 pub(super) struct WireFields<'a>(pub(super) &'a [u8]);
 
 impl<'a> WireFields<'a> {
+    /// Returns those with one of these numbers.
+    pub(super) fn of(
+        self,
+        numbers: &'static [u64],
+    ) -> impl Iterator<Item = Result<WireField<'a>, NoMessage>> {
+        self.filter(move |field| {
+            field.is_err() || field.is_ok_and(|it| numbers.contains(&it.number))
+        })
+    }
+
     fn varint(&mut self) -> Result<u64, NoMessage> {
         let mut value = 0_u64;
         for shift in (0..64).step_by(7) {

@@ -16,12 +16,13 @@ fn models() -> Vec<TestModel> {
     vec![granted("product", product()), granted("endless", endless(&[ANY]))]
 }
 
-/// Checks that the program still serves others.
-fn serves(program: &ModelProgram) {
-    let mut lambda = program.lambda("healthy", &models()[..1]);
-    lambda.open("product").unwrap();
-    let outputs = lambda.run("product", &[floats("x", &[1, 3], &[1.0; 3])]).unwrap();
-    assert_eq!(outputs[0].floats(), [9.0, 12.0]);
+fn open() -> ModelCall {
+    ModelCall::Open { model: "product".to_owned() }
+}
+
+fn request(id: u64, call: ModelCall) -> Vec<u8> {
+    let request = ModelRequest { id, deadline_ns: None, regions: [0; 2], call };
+    serde_json::to_vec(&request).unwrap()
 }
 
 /// Waits until the program has closed the connection.
@@ -46,48 +47,36 @@ fn is_closed(socket: &OwnedFd) {
 #[test]
 fn messages_that_are_no_calls_close_the_connection() {
     let program = ModelProgram::start(&[]);
-    let open = || ModelCall::Open { model: "product".to_owned() };
-    let bytes = |id| {
-        let request = ModelRequest { id, deadline_ns: None, regions: [0; 2], call: open() };
-        serde_json::to_vec(&request).unwrap()
-    };
     for garbage in [
         b"{}".to_vec(),
         b"\xff\xfe\0".to_vec(),
         vec![b'['; MESSAGE_MAX],
         vec![b'x'; MESSAGE_MAX + 1],
-        bytes(0),
+        request(0, open()),
         br#"{"id":1,"deadline_ns":null,"call":{"run":{"model":"m","inputs":[{"name":"x"}]}}}"#
             .to_vec(),
         br#"{"id":1,"deadline_ns":-1,"call":{"reserve":{"bytes":1e30}}}"#.to_vec(),
     ] {
-        let (socket, other) = ModelClient::pair().unwrap();
-        program.add("hostile", &models(), &other);
-        drop(other);
+        let socket = program.connect("hostile", &models());
         send(&socket, &garbage, SendFlags::NOSIGNAL).unwrap();
         is_closed(&socket);
     }
-    let (socket, other) = ModelClient::pair().unwrap();
-    program.add("repeats", &models(), &other);
-    drop(other);
-    send(&socket, &bytes(2), SendFlags::NOSIGNAL).unwrap();
-    send(&socket, &bytes(2), SendFlags::NOSIGNAL).unwrap();
+    let socket = program.connect("repeats", &models());
+    for _ in 0..2 {
+        send(&socket, &request(2, open()), SendFlags::NOSIGNAL).unwrap();
+    }
     is_closed(&socket);
-    serves(&program);
+    program.serves();
 }
 
 #[test]
 fn a_newer_call_replaces_the_one_before() {
     let program = ModelProgram::start(&["--run-max", "60"]);
-    let (socket, other) = ModelClient::pair().unwrap();
-    program.add("impatient", &models(), &other);
-    drop(other);
+    let socket = program.connect("impatient", &models());
     let mut lambda = ModelUser::new(socket.try_clone().unwrap());
     lambda.open("product").unwrap();
     for id in 100..130 {
-        let call = ModelCall::Open { model: "product".to_owned() };
-        let request = ModelRequest { id, deadline_ns: None, regions: [0; 2], call };
-        send(&socket, &serde_json::to_vec(&request).unwrap(), SendFlags::NOSIGNAL).unwrap();
+        send(&socket, &request(id, open()), SendFlags::NOSIGNAL).unwrap();
     }
     // Its replies are read, and the last call has one.
     let last = std::iter::repeat_with(|| {
@@ -96,29 +85,19 @@ fn a_newer_call_replaces_the_one_before() {
         serde_json::from_slice::<ModelReply>(&bytes[..length]).unwrap()
     });
     assert!(last.into_iter().find(|reply| reply.id == 129).unwrap().result.is_ok());
-    serves(&program);
+    program.serves();
 }
 
 #[test]
 fn a_lambda_that_does_not_read_its_replies_is_disconnected() {
     let program = ModelProgram::start(&[]);
-    let (socket, other) = ModelClient::pair().unwrap();
-    program.add("deaf", &models(), &other);
-    drop(other);
-    let mut id = 0;
-    while id < 100_000 {
-        id += 1;
-        let call = ModelCall::Reserve { bytes: 64 };
-        let bytes =
-            serde_json::to_vec(&ModelRequest { id, deadline_ns: None, regions: [0; 2], call })
-                .unwrap();
-        match send(&socket, &bytes, SendFlags::NOSIGNAL) {
-            Ok(_) => {}
-            Err(_) => break,
-        }
-    }
-    assert!(id < 100_000, "all calls were read");
-    serves(&program);
+    let socket = program.connect("deaf", &models());
+    let fails = |id: u64| {
+        let bytes = request(id, ModelCall::Reserve { bytes: 64 });
+        send(&socket, &bytes, SendFlags::NOSIGNAL).is_err()
+    };
+    assert!((1..100_000).any(fails), "all calls were read");
+    program.serves();
 }
 
 #[test]
@@ -133,10 +112,9 @@ fn a_lambda_that_ends_while_it_waits_leaves_nothing_behind() {
     }
     for _ in 0..20 {
         let mut lambda = program.lambda("early", &models());
-        let open = ModelCall::Open { model: "product".to_owned() };
-        let _ = lambda.client.call(open, None, Some(Instant::now()));
+        let _ = lambda.client.call(open(), None, Some(Instant::now()));
     }
-    serves(&program);
+    program.serves();
     let status = program.status(|status| status.clients == 0 && status.waiting == 0);
     assert_eq!(status.models.len(), 1, "it is kept for a while");
 }
@@ -189,14 +167,12 @@ fn log_lines_that_are_not_read_delay_nothing_and_are_counted() {
     let mut program = ModelProgram::start(&[]);
     // Each makes a log line with its name; the pipe of standard error holds 64 KiB.
     let breaks_the_protocol = |index: usize| {
-        let (lambda, other) = ModelClient::pair().unwrap();
-        program.add(&format!("{index}-{}", "x".repeat(4000)), &[], &other);
-        drop(other);
+        let lambda = program.connect(&format!("{index}-{}", "x".repeat(4000)), &[]);
         send(&lambda, b"{}", SendFlags::empty()).unwrap();
         is_closed(&lambda);
     };
     (0..40).for_each(breaks_the_protocol);
-    serves(&program);
+    program.serves();
     let unread = program.unread_log();
     assert!(unread.contains("connection to a lambda closed"), "{unread}");
     breaks_the_protocol(40);

@@ -1,6 +1,8 @@
 //! Writes small ONNX models: messages of protobuf, by hand.
 #![allow(dead_code)]
 
+use gleaner_protocol::inference::Element;
+
 /// Types of elements, by their number in ONNX.
 pub const FLOAT32: i64 = 1;
 pub const UINT8: i64 = 2;
@@ -12,6 +14,21 @@ pub const STRING: i64 = 8;
 pub const BOOL: i64 = 9;
 pub const FLOAT16: i64 = 10;
 pub const FLOAT64: i64 = 11;
+
+/// Returns the number of a type of elements.
+pub fn number_of(element: Element) -> i64 {
+    match element {
+        Element::Float32 => FLOAT32,
+        Element::Float16 => FLOAT16,
+        Element::Float64 => FLOAT64,
+        Element::Int8 => INT8,
+        Element::Int16 => INT16,
+        Element::Int32 => INT32,
+        Element::Int64 => INT64,
+        Element::Uint8 => UINT8,
+        Element::Boolean => BOOL,
+    }
+}
 
 /// A length that may be any.
 pub const ANY: i64 = -1;
@@ -133,22 +150,16 @@ pub fn model_with_opset(graph: &Proto, version: i64) -> Vec<u8> {
 
 /// Returns a model with one node, whose input is `x` and whose output is `y`.
 pub fn unary(operator: &str, element: i64, shape: &[i64]) -> Vec<u8> {
-    model(&graph(
-        &[node(operator, &["x"], &["y"], &[])],
-        &[],
-        &[value("x", element, shape)],
-        &[value("y", element, shape)],
-    ))
+    with_node(node(operator, &["x"], &["y"], &[]), element, shape)
+}
+
+fn with_node(node: Proto, element: i64, shape: &[i64]) -> Vec<u8> {
+    model(&graph(&[node], &[], &[value("x", element, shape)], &[value("y", element, shape)]))
 }
 
 /// Returns a model that adds `x` to itself.
 pub fn doubled(element: i64, shape: &[i64]) -> Vec<u8> {
-    model(&graph(
-        &[node("Add", &["x", "x"], &["y"], &[])],
-        &[],
-        &[value("x", element, shape)],
-        &[value("y", element, shape)],
-    ))
+    with_node(node("Add", &["x", "x"], &["y"], &[]), element, shape)
 }
 
 /// Returns a model of an endless loop. Its input has any length, so that it does not run at its

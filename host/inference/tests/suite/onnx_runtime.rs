@@ -4,9 +4,7 @@ use std::time::Duration;
 
 use gleaner_protocol::inference::{Element, ModelFaultKind};
 
-use crate::onnx::{
-    ANY, BOOL, FLOAT16, FLOAT32, FLOAT64, INT8, INT16, INT32, INT64, UINT8, endless, product, unary,
-};
+use crate::onnx::{ANY, endless, number_of, product, unary};
 use crate::support::{ModelProgram, TestModel, TestTensor, fault, floats, granted};
 
 /// Returns the path of the library, if there is one for tests.
@@ -83,19 +81,8 @@ fn it_is_used_where_it_is_found_and_no_gpu_is_replaced_silently() {
 fn every_type_of_elements_passes_it() {
     let Some(library) = library() else { return };
     let program = ModelProgram::start(&["--ort-lib", &library]);
-    let types = [
-        (FLOAT32, Element::Float32),
-        (FLOAT16, Element::Float16),
-        (FLOAT64, Element::Float64),
-        (INT8, Element::Int8),
-        (INT16, Element::Int16),
-        (INT32, Element::Int32),
-        (INT64, Element::Int64),
-        (UINT8, Element::Uint8),
-        (BOOL, Element::Boolean),
-    ];
-    for (number, element) in types {
-        let model = by("m", unary("Identity", number, &[2]), &["onnxruntime"]);
+    for element in Element::ALL {
+        let model = by("m", unary("Identity", number_of(element), &[2]), &["onnxruntime"]);
         let mut lambda = program.lambda("types", &[model]);
         lambda.open("m").unwrap();
         let bytes: Vec<u8> = match element {

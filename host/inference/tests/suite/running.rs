@@ -3,8 +3,8 @@
 use gleaner_protocol::inference::{Element, ModelFaultKind, ModelState};
 
 use crate::onnx::{
-    ANY, BOOL, FLOAT16, FLOAT32, FLOAT64, INT8, INT32, INT64, Proto, UINT8, doubled, graph, model,
-    node, product, unary, value, value_of,
+    ANY, BOOL, FLOAT32, FLOAT64, INT8, INT64, Proto, UINT8, doubled, graph, model, node, number_of,
+    product, unary, value, value_of,
 };
 use crate::support::{ModelProgram, TestTensor, fault, floats, granted, integers};
 
@@ -37,41 +37,16 @@ fn a_model_is_opened_and_run_with_any_batch() {
 fn every_type_of_elements_is_returned_as_it_is_declared() {
     let program = ModelProgram::start(&[]);
     let half = |value: f32| half::f16::from_f32(value).to_le_bytes().to_vec();
-    type Case = (&'static str, i64, Element, Vec<u8>, Vec<u8>);
-    let cases: Vec<Case> = vec![
-        (
-            "f32",
-            FLOAT32,
-            Element::Float32,
-            1.5_f32.to_le_bytes().into(),
-            3_f32.to_le_bytes().into(),
-        ),
-        ("f16", FLOAT16, Element::Float16, half(1.5), half(3.0)),
-        (
-            "f64",
-            FLOAT64,
-            Element::Float64,
-            1.5_f64.to_le_bytes().into(),
-            3_f64.to_le_bytes().into(),
-        ),
-        (
-            "i32",
-            INT32,
-            Element::Int32,
-            (-4_i32).to_le_bytes().into(),
-            (-8_i32).to_le_bytes().into(),
-        ),
-        (
-            "i64",
-            INT64,
-            Element::Int64,
-            (-4_i64).to_le_bytes().into(),
-            (-8_i64).to_le_bytes().into(),
-        ),
+    let cases = [
+        ("f32", Element::Float32, [1.5_f32, 3.0].map(|it| it.to_le_bytes().to_vec())),
+        ("f16", Element::Float16, [1.5, 3.0].map(half)),
+        ("f64", Element::Float64, [1.5_f64, 3.0].map(|it| it.to_le_bytes().to_vec())),
+        ("i32", Element::Int32, [-4_i32, -8].map(|it| it.to_le_bytes().to_vec())),
+        ("i64", Element::Int64, [-4_i64, -8].map(|it| it.to_le_bytes().to_vec())),
     ];
     let models: Vec<_> = cases
         .iter()
-        .map(|(name, number, ..)| granted(name, doubled(*number, &[1])))
+        .map(|(name, element, _)| granted(name, doubled(number_of(*element), &[1])))
         .chain([
             granted("not", unary("Not", BOOL, &[3])),
             granted("u8", unary("Identity", UINT8, &[3])),
@@ -87,7 +62,7 @@ fn every_type_of_elements_is_returned_as_it_is_declared() {
         assert_eq!(output.element, element);
         output.bytes
     };
-    for (name, _, element, input, output) in cases {
+    for (name, element, [input, output]) in cases {
         assert_eq!(run(name, element, input), output, "{name}");
     }
     assert_eq!(run("not", Element::Boolean, vec![0, 1, 200]), [1, 0, 0]);

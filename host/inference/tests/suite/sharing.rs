@@ -10,11 +10,6 @@ use crate::support::{
     ModelProgram, ModelUser, TestModel, fault, floats, granted, in_future, wait_for,
 };
 
-/// A model that takes some ms.
-fn slow() -> TestModel {
-    slow_of(8)
-}
-
 /// A model that takes some ms for 8 products of large matrices.
 fn slow_of(products: usize) -> TestModel {
     let size = 400;
@@ -78,11 +73,11 @@ fn a_lambda_that_always_runs_does_not_starve_another() {
     let program = ModelProgram::start(&[]);
     let ends = AtomicBool::new(false);
     let counts = [(); 2].map(|()| AtomicUsize::new(0));
-    let mut patient = program.lambda("patient", &[slow()]);
+    let mut patient = program.lambda("patient", &[slow_of(8)]);
     patient.open("slow").unwrap();
     std::thread::scope(|scope| {
         for (index, count) in counts.iter().enumerate() {
-            let (ends, mut flood) = (&ends, program.lambda("flood", &[slow()]));
+            let (ends, mut flood) = (&ends, program.lambda("flood", &[slow_of(8)]));
             scope.spawn(move || {
                 flood.open("slow").unwrap();
                 let mut seed = index * 100_000;

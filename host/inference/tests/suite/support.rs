@@ -18,6 +18,7 @@ use gleaner_protocol::inference::{
 };
 use sha2::{Digest, Sha256};
 
+use crate::onnx::product;
 use crate::shared_data::shared_file;
 
 /// Time after which an awaited event is missing.
@@ -92,9 +93,14 @@ impl ModelProgram {
 
     /// Adds a lambda with its models.
     pub fn lambda(&self, name: &str, models: &[TestModel]) -> ModelUser {
+        ModelUser::new(self.connect(name, models))
+    }
+
+    /// Adds a lambda with its models; returns its socket.
+    pub fn connect(&self, name: &str, models: &[TestModel]) -> OwnedFd {
         let (lambda, other) = ModelClient::pair().unwrap();
         self.add(name, models, &other);
-        ModelUser::new(lambda)
+        lambda
     }
 
     /// Adds a lambda whose process has the other end of `socket`.
@@ -111,6 +117,14 @@ impl ModelProgram {
         let models = models.iter().map(|model| model.grant.clone()).collect();
         let client = AddClient { name: name.to_owned(), memory: MAX_TENSOR_BYTES, models };
         control.add_client(&client, socket.as_fd()).unwrap();
+    }
+
+    /// Checks that it still serves other lambdas.
+    pub fn serves(&self) {
+        let mut lambda = self.lambda("healthy", &[granted("product", product())]);
+        lambda.open("product").unwrap();
+        let outputs = lambda.run("product", &[floats("x", &[1, 3], &[1.0; 3])]).unwrap();
+        assert_eq!(outputs[0].floats(), [9.0, 12.0]);
     }
 
     pub fn id(&self) -> u32 {

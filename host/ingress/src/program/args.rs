@@ -37,6 +37,9 @@ pub(super) struct Args {
     /// as one.
     #[arg(long, value_name = "FILE|DIR")]
     pub(super) drive: Vec<PathBuf>,
+    /// Merge all files by time, even if they are separate drives.
+    #[arg(long)]
+    pub(super) merge: bool,
     /// Speed of the drive: 2 plays it twice as fast as it was recorded.
     #[arg(long, value_name = "FACTOR", default_value_t = 1.0, value_parser = rate)]
     pub(super) rate: f64,

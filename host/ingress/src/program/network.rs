@@ -1,7 +1,15 @@
 //! Turns DDS errors into failures with an exit code and help.
 
-use gleaner_base::{Exit, Explain, Failure};
+use gleaner_base::{Exit, Explain, Failure, ignored_variables};
 use gleaner_dds::DdsError;
+use tracing::warn;
+
+/// Warns of each variable by which the nodes may be out of reach.
+pub(super) fn warn_of_variables() {
+    for variable in ignored_variables() {
+        warn!(%variable, "Gleaner receives by DDS with multicast, and ignores this variable");
+    }
+}
 
 /// A DDS error, for users.
 #[derive(Debug, thiserror::Error)]

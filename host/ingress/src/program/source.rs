@@ -1,22 +1,26 @@
 //! Opens the source of samples: the network or a drive.
 
-use gleaner_base::{Exit, Failure};
+use gleaner_base::Failure;
 use gleaner_dds::Dds;
 use gleaner_drives::{DriveOptions, DrivePlayer, ReplayError};
 use gleaner_transport::LiveSource;
 
 use super::args::Args;
-use super::network::NetworkError;
+use super::network::{NetworkError, warn_of_variables};
 
 /// Opens the source that `args` name. The process runs in real time, or not.
 pub(super) fn open(args: Args, real_time: bool) -> Result<Box<dyn LiveSource>, Failure> {
     let clock = args.clock();
     if !args.is_of_network() {
-        let options =
-            DriveOptions { unpack_in: args.unpack_in, merge: true, ..DriveOptions::default() };
+        let options = DriveOptions {
+            unpack_in: args.unpack_in,
+            merge: args.merge,
+            ..DriveOptions::default()
+        };
         let drive = DrivePlayer::open(&args.drive, &options, clock, args.rate);
         return Ok(Box::new(drive.map_err(|error| unplayable(&error))?));
     }
+    warn_of_variables();
     let mut network = args.network.options(args.node).map_err(NetworkError::failure)?;
     network.largest = args.largest.unwrap_or(network.largest);
     network.clock = clock;
@@ -28,14 +32,7 @@ pub(super) fn open(args: Args, real_time: bool) -> Result<Box<dyn LiveSource>, F
 }
 
 fn unplayable(error: &ReplayError) -> Failure {
-    let exit = match error {
-        ReplayError::Damaged { .. } => Exit::DriveDamaged,
-        ReplayError::Read { .. } | ReplayError::Unpack { .. } | ReplayError::NoRoom { .. } => {
-            Exit::Internal
-        }
-        _ => Exit::Usage,
-    };
-    let failure = Failure::caused_by(exit, "cannot play the drive", error);
+    let failure = Failure::caused_by(error.exit(), "cannot play the drive", error);
     match error.help() {
         Some(help) => failure.with_help(help),
         None => failure,

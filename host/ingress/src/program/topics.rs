@@ -8,7 +8,7 @@ use gleaner_base::{Exit, Failure};
 use gleaner_dds::{Dds, NetworkArgs};
 use gleaner_protocol::ingress::{IngressReport, TopicInfo};
 
-use super::network::NetworkError;
+use super::network::{NetworkError, warn_of_variables};
 
 /// Default time to listen: participants announce themselves every few seconds, and answer a new
 /// one at once.
@@ -31,6 +31,7 @@ pub(super) fn run(args: TopicsArgs, reports: &mut impl Write) -> Result<(), Fail
     let wait = wait.ok_or_else(|| {
         Failure::new(Exit::Usage, format!("--wait {}: use 0 to 3600 s", args.wait))
     })?;
+    warn_of_variables();
     let mut options = args.network.options("/gleaner/topics").map_err(NetworkError::failure)?;
     // No samples are received.
     options.largest = 0;

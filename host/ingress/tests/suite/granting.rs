@@ -108,10 +108,8 @@ fn further_topics_are_granted_by_name() {
     let info = feed.topic(1, TIMEOUT).unwrap().info;
     assert_eq!(info.definitions, None);
     assert_eq!(feed.topic(0, TIMEOUT).unwrap().info.id, 0);
-    assert_eq!(
-        refusal(&mut feed, 0),
-        RefusedTopic::Other(vec!["id 0 is granted twice".to_owned()])
-    );
+    let twice = RefusedTopic::Other(vec!["id 0 is granted twice".to_owned()]);
+    assert_eq!(refusal(&mut feed, 0), twice);
 }
 
 #[test]
@@ -132,8 +130,7 @@ fn definitions_are_answered_while_the_source_has_them() {
 
 #[test]
 fn a_reader_sees_the_state_of_the_source() {
-    let numbers = Numbers::on("/number");
-    let mut ingress = RunningIngress::over(numbers.source.clone());
+    let (numbers, mut ingress) = RunningIngress::of_numbers("/number");
     let mut feed = ingress.reader("one", vec![grant(5, "/number")]);
     numbers.source.fail("it is unplugged");
     wait_for(|| {
@@ -148,8 +145,7 @@ fn a_reader_sees_the_state_of_the_source() {
 
 #[test]
 fn a_reader_that_is_restarted_has_the_same_name() {
-    let mut numbers = Numbers::on("/number");
-    let mut ingress = RunningIngress::over(numbers.source.clone());
+    let (mut numbers, mut ingress) = RunningIngress::of_numbers("/number");
     for _ in 0..20 {
         let mut reading = ingress.reading("one", grant(0, "/number"));
         let sent = numbers.publish_all(3);

@@ -11,15 +11,14 @@ use gleaner_protocol::ingress::{IngressLink, ReaderMessage};
 use gleaner_protocol::link::Incoming;
 use gleaner_regions::ControlRegion;
 
-use crate::support::{Numbers, RunningIngress, grant, wait_for};
+use crate::support::{RunningIngress, grant, wait_for};
 
 /// Words of a control page that a hostile reader overwrites: more than it is granted.
 const GARBAGE_WORDS: usize = 16;
 
 #[test]
 fn garbage_on_a_socket_ends_only_that_reader() {
-    let mut numbers = Numbers::on("/number");
-    let mut ingress = RunningIngress::over(numbers.source.clone());
+    let (mut numbers, mut ingress) = RunningIngress::of_numbers("/number");
     let mut honest = ingress.reading("honest", grant(0, "/number"));
     let mut random = 0x9e37_79b9_7f4a_7c15_u64;
     for round in 0..50 {
@@ -44,8 +43,7 @@ fn garbage_on_a_socket_ends_only_that_reader() {
 
 #[test]
 fn a_reader_that_never_reads_delays_no_one() {
-    let mut numbers = Numbers::on("/number");
-    let mut ingress = RunningIngress::over(numbers.source.clone());
+    let (mut numbers, mut ingress) = RunningIngress::of_numbers("/number");
     let _silent: Vec<OwnedFd> = (0..20)
         .map(|n| ingress.socket(&format!("silent {n}"), vec![grant(0, "/number")]))
         .collect();
@@ -74,8 +72,7 @@ fn control_page(socket: OwnedFd) -> (IngressLink, ControlRegion) {
 #[test]
 fn garbage_on_control_pages_neither_tears_samples_nor_stops_the_ingress() {
     let samples = if std::env::var_os("GLEANER_LONG").is_some() { 2_000_000 } else { 50_000 };
-    let mut numbers = Numbers::on("/number");
-    let mut ingress = RunningIngress::over(numbers.source.clone());
+    let (mut numbers, mut ingress) = RunningIngress::of_numbers("/number");
     let mut honest = ingress.reading("honest", grant(0, "/number"));
     let stop = std::sync::atomic::AtomicBool::new(false);
     let pages: Vec<_> = (0..3)

@@ -3,7 +3,7 @@
 use gleaner_feed::Feed;
 use gleaner_protocol::ingress::PublishGrant;
 
-use crate::support::{Numbers, RunningIngress, TYPE, collect, grant, wait_for};
+use crate::support::{RunningIngress, TYPE, collect, grant, wait_for};
 
 fn publish(topic: &str) -> PublishGrant {
     PublishGrant { topic: topic.to_owned(), type_name: TYPE.to_owned(), depth: 4, max_bytes: 64 }
@@ -11,8 +11,7 @@ fn publish(topic: &str) -> PublishGrant {
 
 #[test]
 fn messages_of_a_reader_reach_the_source() {
-    let numbers = Numbers::on("/out");
-    let mut ingress = RunningIngress::over(numbers.source.clone());
+    let (_, mut ingress) = RunningIngress::of_numbers("/out");
     let mut reading = ingress.reading("other", grant(0, "/out"));
     let feed = ingress.publisher("one", vec![publish("/no such topic"), publish("/out")]);
     for value in 1..=3 {
@@ -24,7 +23,7 @@ fn messages_of_a_reader_reach_the_source() {
 
 #[test]
 fn messages_that_cannot_be_published_are_counted() {
-    let mut ingress = RunningIngress::over(Numbers::on("/out").source);
+    let (_, mut ingress) = RunningIngress::of_numbers("/out");
     let mut feed = ingress.publisher("one", vec![publish("/nowhere")]);
     for _ in 0..7 {
         feed.publisher(0).publish(&[1]).unwrap();
@@ -37,8 +36,7 @@ fn messages_that_cannot_be_published_are_counted() {
 
 #[test]
 fn messages_that_are_too_long_are_counted_and_not_published() {
-    let numbers = Numbers::on("/out");
-    let mut ingress = RunningIngress::over(numbers.source.clone());
+    let (_, mut ingress) = RunningIngress::of_numbers("/out");
     let mut reading = ingress.reading("other", grant(0, "/out"));
     let mut feed = ingress.publisher("one", vec![publish("/out")]);
     for len in [65, 64, 10_000] {
@@ -53,7 +51,7 @@ fn messages_that_are_too_long_are_counted_and_not_published() {
 
 #[test]
 fn a_topic_that_was_not_granted_ends_the_connection() {
-    let mut ingress = RunningIngress::over(Numbers::on("/out").source);
+    let (_, mut ingress) = RunningIngress::of_numbers("/out");
     let mut feed = ingress.publisher("one", vec![publish("/out")]);
     let mut other = ingress.publisher("two", vec![publish("/out")]);
     feed.publisher(1).publish(&[1]).unwrap();
@@ -70,8 +68,7 @@ fn flood(feed: &Feed, message: &[u8]) -> u64 {
 
 #[test]
 fn a_flood_of_messages_is_slowed_down_at_its_origin() {
-    let numbers = Numbers::on("/out");
-    let mut ingress = RunningIngress::over(numbers.source.clone());
+    let (_, mut ingress) = RunningIngress::of_numbers("/out");
     let mut reading = ingress.reading("other", grant(0, "/out"));
     let mut feed = ingress.publisher("hostile", vec![publish("/out")]);
     let mut sent = 0;

@@ -6,12 +6,11 @@ use gleaner_feed::{FedTopic, FeedEvent, LastingFeed};
 use gleaner_protocol::Handover;
 use gleaner_transport::StoredMeta;
 
-use crate::support::{Numbers, RunningIngress, TEXT, TYPE, grant, wait_for};
+use crate::support::{RunningIngress, TEXT, TYPE, grant, wait_for};
 
 #[test]
 fn an_ingress_that_ended_before_it_was_joined_leaves_its_samples_to_the_reader() {
-    let mut numbers = Numbers::on("/number");
-    let mut ingress = RunningIngress::over(numbers.source.clone());
+    let (mut numbers, mut ingress) = RunningIngress::of_numbers("/number");
     let feed = ingress.reader("reader", vec![grant(0, "/number")]);
     let (starter, handover) = UnixStream::pair().unwrap();
     let mut feed = LastingFeed::new(feed, Some(handover.into()));

@@ -6,12 +6,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use gleaner_protocol::ingress::TopicGrant;
 use gleaner_transport::{Delivery, Qos, StoredMeta, TopicCounters};
 
-use crate::support::{Numbers, RunningIngress, collect, grant, wait_for};
+use crate::support::{RunningIngress, collect, grant, wait_for};
 
 #[test]
 fn every_reader_receives_every_sample_from_its_beginning() {
-    let mut numbers = Numbers::on("/number");
-    let mut ingress = RunningIngress::over(numbers.source.clone());
+    let (mut numbers, mut ingress) = RunningIngress::of_numbers("/number");
     let mut first = ingress.reading("first", grant(0, "/number"));
     let early = numbers.publish_all(5);
     let mut second = ingress.reading("second", grant(7, "/number"));
@@ -27,8 +26,7 @@ fn every_reader_receives_every_sample_from_its_beginning() {
 
 #[test]
 fn a_sample_that_is_too_big_for_one_reader_reaches_the_others() {
-    let mut numbers = Numbers::on("/number");
-    let mut ingress = RunningIngress::over(numbers.source.clone());
+    let (mut numbers, mut ingress) = RunningIngress::of_numbers("/number");
     let mut small = ingress.reading("small", grant(0, "/number"));
     let mut large =
         ingress.reading("large", TopicGrant { max_bytes: Some(1000), ..grant(0, "/number") });
@@ -50,8 +48,7 @@ fn a_sample_that_is_too_big_for_one_reader_reaches_the_others() {
 
 #[test]
 fn digests_are_summed_while_a_reader_needs_them() {
-    let mut numbers = Numbers::on("/number");
-    let mut ingress = RunningIngress::over(numbers.source.clone());
+    let (mut numbers, mut ingress) = RunningIngress::of_numbers("/number");
     let digests = |reading: &crate::support::Reading| {
         let newest = reading.topic.reader.newest_before(u64::MAX).unwrap().unwrap();
         StoredMeta::of_words(newest.meta()).digests
@@ -77,8 +74,7 @@ fn digests_are_summed_while_a_reader_needs_them() {
 #[test]
 fn readers_come_and_go_without_loss_for_others() {
     const SAMPLES: u64 = 30_000;
-    let mut numbers = Numbers::on("/number");
-    let mut ingress = RunningIngress::over(numbers.source.clone());
+    let (mut numbers, mut ingress) = RunningIngress::of_numbers("/number");
     // All samples stay: the reader may be slow.
     let mut steady =
         ingress.reading("steady", TopicGrant { depth: 1 << 16, ..grant(0, "/number") });
@@ -113,8 +109,7 @@ fn readers_come_and_go_without_loss_for_others() {
 
 #[test]
 fn a_later_reader_of_larger_samples_costs_the_others_nothing() {
-    let mut numbers = Numbers::on("/number");
-    let mut ingress = RunningIngress::over(numbers.source.clone());
+    let (mut numbers, mut ingress) = RunningIngress::of_numbers("/number");
     let mut small = ingress.reading("small", grant(0, "/number"));
     numbers.publish_all(3);
     let mut large =
@@ -137,8 +132,7 @@ fn a_later_reader_of_larger_samples_costs_the_others_nothing() {
 
 #[test]
 fn what_a_reader_held_is_free_after_its_end() {
-    let mut numbers = Numbers::on("/number");
-    let mut ingress = RunningIngress::over(numbers.source.clone());
+    let (mut numbers, mut ingress) = RunningIngress::of_numbers("/number");
     let mut other = ingress.reading("other", grant(0, "/number"));
     for round in 0..40 {
         let holder = ingress.reading(&format!("holder {round}"), grant(0, "/number"));
@@ -168,8 +162,7 @@ fn what_a_reader_held_is_free_after_its_end() {
 
 #[test]
 fn a_region_without_room_for_more_holds_gets_a_second_one() {
-    let mut numbers = Numbers::on("/number");
-    let mut ingress = RunningIngress::over(numbers.source.clone());
+    let (mut numbers, mut ingress) = RunningIngress::of_numbers("/number");
     let mut readers: Vec<_> =
         (0..70).map(|n| ingress.reading(&format!("r{n}"), grant(0, "/number"))).collect();
     let all = numbers.publish_all(20);
@@ -189,8 +182,7 @@ fn a_region_without_room_for_more_holds_gets_a_second_one() {
 
 #[test]
 fn a_later_reader_of_a_latched_topic_receives_what_is_shown() {
-    let mut numbers = Numbers::on("/map");
-    let mut ingress = RunningIngress::over(numbers.source.clone());
+    let (mut numbers, mut ingress) = RunningIngress::of_numbers("/map");
     let qos = Qos::Fixed { reliable: true, transient_local: true, depth: 3 };
     let latched = TopicGrant { qos, depth: 2, ..grant(0, "/map") };
     let mut first = ingress.reading("first", latched.clone());
@@ -212,8 +204,7 @@ fn a_later_reader_of_a_latched_topic_receives_what_is_shown() {
 
 #[test]
 fn a_sample_that_was_too_big_for_all_comes_again_for_a_larger_reader() {
-    let mut numbers = Numbers::on("/map");
-    let mut ingress = RunningIngress::over(numbers.source.clone());
+    let (mut numbers, mut ingress) = RunningIngress::of_numbers("/map");
     let mut small = ingress.reading("small", grant(0, "/map"));
     numbers.publish(1000);
     let larger = TopicGrant { max_bytes: Some(1000), ..grant(0, "/map") };
@@ -230,8 +221,7 @@ fn a_sample_that_was_too_big_for_all_comes_again_for_a_larger_reader() {
 
 #[test]
 fn a_topic_without_readers_is_unsubscribed() {
-    let mut numbers = Numbers::on("/number");
-    let mut ingress = RunningIngress::over(numbers.source.clone());
+    let (mut numbers, mut ingress) = RunningIngress::of_numbers("/number");
     let reading = ingress.reading("one", grant(0, "/number"));
     numbers.publish_all(2);
     ingress.status(|status| status.readers == 1);
@@ -246,8 +236,7 @@ fn a_topic_without_readers_is_unsubscribed() {
 
 #[test]
 fn the_end_of_the_ingress_leaves_held_samples_as_they_are() {
-    let mut numbers = Numbers::on("/number");
-    let mut ingress = RunningIngress::over(numbers.source.clone());
+    let (mut numbers, mut ingress) = RunningIngress::of_numbers("/number");
     let mut reading = ingress.reading("one", grant(0, "/number"));
     numbers.publish(40);
     let held = reading.topic.reader.get(0).unwrap().unwrap();
@@ -258,8 +247,7 @@ fn the_end_of_the_ingress_leaves_held_samples_as_they_are() {
 
 #[test]
 fn a_sample_wakes_the_readers_that_wait_for_it() {
-    let mut numbers = Numbers::on("/number");
-    let mut ingress = RunningIngress::over(numbers.source.clone());
+    let (mut numbers, mut ingress) = RunningIngress::of_numbers("/number");
     let mut reading = ingress.reading("waits", grant(0, "/number"));
     let quiet = TopicGrant { wakes: false, ..grant(0, "/number") };
     let quiet = ingress.reading("quiet", quiet);

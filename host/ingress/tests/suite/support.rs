@@ -8,7 +8,6 @@ use std::time::{Duration, Instant};
 
 use gleaner_feed::{FedTopic, Feed};
 use gleaner_ingress::Ingress;
-use gleaner_messages::Endian;
 use gleaner_protocol::ingress::{
     AddReader, HoldGrant, IngressControl, IngressReport, IngressStatus, PublishGrant, TopicGrant,
 };
@@ -35,6 +34,13 @@ impl RunningIngress {
         let (control, thread) =
             Ingress::start_with_reports(Box::new(source), report).expect("a thread");
         Self { control: Some(control), thread: Some(thread), reports }
+    }
+
+    /// Starts an ingress of a loopback with one topic.
+    pub fn of_numbers(topic: &'static str) -> (Numbers, Self) {
+        let numbers = Numbers::on(topic);
+        let ingress = Self::over(numbers.source.clone());
+        (numbers, ingress)
     }
 
     pub fn control(&mut self) -> &mut IngressControl {
@@ -165,14 +171,8 @@ impl Numbers {
 
 pub fn meta(seq: u64) -> SampleMeta {
     SampleMeta {
-        at_ns: seq as i64 * 10,
         publish_ns: seq as i64,
-        writer: Guid(*b"number publisher"),
-        seq,
-        endian: Endian::Little,
-        options: [0; 2],
-        layout: 0,
-        is_latched: false,
+        ..SampleMeta::new(seq as i64 * 10, Guid(*b"number publisher"), seq)
     }
 }
 

@@ -122,11 +122,8 @@ fn texts_are_used_if_they_are_equivalent_to_the_fields() {
     let described = read("std_msgs/Header", HEADER, &response(HEADER_TYPES, TEXTS)).unwrap();
     assert_eq!(described.without_texts, None);
     assert!(described.text.starts_with("# When and where.\n"), "{}", described.text);
-    assert!(
-        described.text.contains("MSG: builtin_interfaces/Time\nint32 sec\n"),
-        "{}",
-        described.text
-    );
+    let nested = "MSG: builtin_interfaces/Time\nint32 sec\n";
+    assert!(described.text.contains(nested), "{}", described.text);
 }
 
 #[test]
@@ -145,22 +142,16 @@ fn missing_invalid_or_wrong_texts_are_replaced_by_the_fields() {
     ] {
         let described = read("std_msgs/Header", HEADER, &response(HEADER_TYPES, texts)).unwrap();
         assert!(described.text.starts_with(plain), "{}", described.text);
-        assert!(
-            described.without_texts.as_ref().unwrap().contains(why),
-            "{:?} is not {why}",
-            described.without_texts
-        );
+        let stated = described.without_texts.unwrap();
+        assert!(stated.contains(why), "{stated:?} is not {why}");
     }
 }
 
 #[test]
 fn a_response_with_another_hash_or_type_is_refused() {
     let another = HEADER.replace('f', "0");
-    assert!(
-        read("std_msgs/Header", &another, &response(HEADER_TYPES, TEXTS))
-            .unwrap_err()
-            .contains("hash")
-    );
+    let error = read("std_msgs/Header", &another, &response(HEADER_TYPES, TEXTS)).unwrap_err();
+    assert!(error.contains("hash"), "{error}");
     let error = read("std_msgs/msg/String", HEADER, &response(HEADER_TYPES, TEXTS)).unwrap_err();
     assert!(error.contains("describes `std_msgs/Header`"), "{error}");
 }
@@ -177,10 +168,8 @@ fn the_error_quotes_the_reason_of_the_node() {
 fn invalid_names_and_kinds_are_refused() {
     for name in ["", "a b", "a\nuint8 b", "a\"", "é"] {
         let types: Types<'_> = &[("p/msg/T", &[(name, 3, "")])];
-        assert!(
-            read("p/T", "", &response(types, &[])).unwrap_err().contains("invalid name"),
-            "{name}"
-        );
+        let error = read("p/T", "", &response(types, &[])).unwrap_err();
+        assert!(error.contains("invalid name"), "{name}: {error}");
     }
     for nested in ["", "T", "../T", "p/msg/a/b", "p/T\n"] {
         let types: Types<'_> = &[("p/msg/T", &[("a", 1, nested)])];
@@ -213,17 +202,9 @@ fn every_kind_that_a_file_can_express_is_generated() {
         (96 + 22, "", "wstring<=5[<=9]"),
         (144 + 16, "", "byte[]"),
     ] {
-        assert_eq!(
-            in_msg(&TypeField {
-                name: "a",
-                kind,
-                capacity: 9,
-                text_capacity: 5,
-                nested: nested.into()
-            })
-            .unwrap(),
-            expected
-        );
+        let (name, nested) = ("a", nested.into());
+        let field = TypeField { name, kind, capacity: 9, text_capacity: 5, nested };
+        assert_eq!(in_msg(&field).unwrap(), expected);
     }
 }
 
@@ -252,9 +233,7 @@ fn a_request_has_the_form_of_the_service_after_its_header() {
     assert_eq!(plain, b"\x14\0\0\0std_msgs/msg/String\0\x02\0\0\0H\0\x01");
     let headed = request("std_msgs/String", "H", Some(RequestHeader([1, 2])));
     assert_eq!(headed[16..], plain);
-    assert_eq!(
-        RequestHeader::split(&headed, Endian::Little),
-        Some((RequestHeader([1, 2]), plain.as_slice()))
-    );
+    let (header, rest) = RequestHeader::split(&headed, Endian::Little).unwrap();
+    assert_eq!((header, rest), (RequestHeader([1, 2]), plain.as_slice()));
     assert_eq!(RequestHeader::split(&headed[..15], Endian::Little), None);
 }

@@ -98,12 +98,8 @@ fn the_text_is_that_of_recordings() {
     assert!(topics.len() >= 3);
     for topic in topics {
         let found = bundled().find(&topic.type_name).unwrap().unwrap();
-        assert_eq!(
-            found.trim_end(),
-            topic.definitions_text.unwrap().trim_end(),
-            "{}",
-            topic.type_name
-        );
+        let recorded = topic.definitions_text.unwrap();
+        assert_eq!(found.trim_end(), recorded.trim_end(), "{}", topic.type_name);
     }
 }
 
@@ -133,10 +129,8 @@ fn folders_precede_bundled_definitions_and_these_installed_ones() {
     let text = |name| sources.find(name).unwrap().unwrap();
     assert_eq!(&*text("std_msgs/msg/Bool"), "bool from_folder\n");
     assert_eq!(&*text("std_msgs/msg/Int8"), "int8 data\n");
-    assert_eq!(
-        *text("maker/msg/Odd"),
-        format!("Part part\n{}\nMSG: maker/Part\nint8 x\n", "=".repeat(80))
-    );
+    let expected = format!("Part part\n{}\nMSG: maker/Part\nint8 x\n", "=".repeat(80));
+    assert_eq!(*text("maker/msg/Odd"), expected);
 }
 
 #[test]

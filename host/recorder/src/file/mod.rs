@@ -80,7 +80,7 @@ pub(crate) struct ClipHeader {
 }
 
 /// A recorded topic, as a clip describes it.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct TopicSchema {
     /// Absolute topic name.
     pub name: String,

@@ -125,16 +125,7 @@ mod tests {
     use super::*;
 
     fn meta(at_ns: i64) -> SampleMeta {
-        SampleMeta {
-            at_ns,
-            publish_ns: 2,
-            writer: Guid([0; 16]),
-            seq: 3,
-            endian: Endian::Little,
-            options: [4, 5],
-            layout: 0,
-            is_latched: false,
-        }
+        SampleMeta { publish_ns: 2, options: [4, 5], ..SampleMeta::new(at_ns, Guid([0; 16]), 3) }
     }
 
     #[test]
@@ -144,9 +135,7 @@ mod tests {
             let topic = written.add_topic(&TopicSchema {
                 name: name.to_owned(),
                 type_name: "T".to_owned(),
-                definitions: None,
-                offered_qos: None,
-                other_definitions: Vec::new(),
+                ..TopicSchema::default()
             });
             written.add_definitions(topic, text);
         }
@@ -159,9 +148,7 @@ mod tests {
         let imu = TopicSchema {
             name: "/imu".to_owned(),
             type_name: "T".to_owned(),
-            definitions: None,
-            offered_qos: None,
-            other_definitions: Vec::new(),
+            ..TopicSchema::default()
         };
         let topic = written.add_topic(&imu);
         messages.iter().for_each(|(at_ns, cdr)| written.count(topic, &meta(*at_ns), cdr));

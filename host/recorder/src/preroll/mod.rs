@@ -114,14 +114,11 @@ impl EntryMeta {
     /// Returns the metadata of the sample.
     pub fn meta(&self) -> SampleMeta {
         SampleMeta {
-            at_ns: self.at_ns,
             publish_ns: self.publish_ns,
-            writer: Guid(self.writer),
-            seq: self.seq,
             endian: if self.is_big_endian { Endian::Big } else { Endian::Little },
             options: self.options,
             layout: self.layout,
-            is_latched: false,
+            ..SampleMeta::new(self.at_ns, Guid(self.writer), self.seq)
         }
     }
 }

@@ -6,14 +6,10 @@ use super::*;
 
 fn held(topic: usize, at: i64) -> EntryMeta {
     let meta = SampleMeta {
-        at_ns: at,
         publish_ns: at - 1,
-        writer: Guid([topic as u8; 16]),
-        seq: at as u64 + 1,
         endian: if at % 2 == 0 { Endian::Little } else { Endian::Big },
         options: [0, at as u8],
-        layout: 0,
-        is_latched: false,
+        ..SampleMeta::new(at, Guid([topic as u8; 16]), at as u64 + 1)
     };
     EntryMeta::sample(topic, &meta, 0)
 }
@@ -65,10 +61,8 @@ fn entries_come_out_in_order_and_the_bound_holds() {
                     assert_eq!(stamps, (first..=at).collect::<Vec<_>>());
                     for (found, bytes) in all {
                         assert_eq!(bytes, payload(found.at_ns, max_len));
-                        assert_eq!(
-                            found,
-                            EntryMeta { len: bytes.len() as u32, ..held(3, found.at_ns) }
-                        );
+                        let len = bytes.len() as u32;
+                        assert_eq!(found, EntryMeta { len, ..held(3, found.at_ns) });
                     }
                 }
             }
@@ -154,11 +148,8 @@ fn the_disk_has_only_the_needed_files_and_none_at_the_end() {
         names
     };
     let mut preroll = Preroll::open(Store::Disk, 16 << 20, folder.clone(), false).unwrap();
-    assert_eq!(
-        names(),
-        ["notes.txt", "x.chunk"],
-        "chunks of an earlier process are deleted, other files stay"
-    );
+    // Chunks of an earlier process are deleted, other files stay.
+    assert_eq!(names(), ["notes.txt", "x.chunk"]);
     for at in 0..1_000 {
         preroll.push(held(1, at), &[at as u8; 100_000], &mut |_| {}).unwrap();
         preroll.trim(at - 30, &mut |_| {}).unwrap();
@@ -179,16 +170,12 @@ fn a_failing_disk_is_reported_with_its_path() {
     let mut preroll = Preroll::open(Store::Disk, 16 << 20, folder.clone(), false).unwrap();
     fs::remove_dir_all(&folder).unwrap();
     let error = preroll.push(held(0, 1), b"x", &mut |_| {}).unwrap_err();
-    assert!(
-        matches!(&error, RecordError::Preroll { path, .. } if path.ends_with("0.chunk")),
-        "{error:?}"
-    );
+    let RecordError::Preroll { path, .. } = &error else { panic!("{error:?}") };
+    assert!(path.ends_with("0.chunk"), "{error:?}");
     fs::write(&folder, "a file").unwrap();
     let refused = Preroll::open(Store::Disk, 16 << 20, folder.clone(), false).err().unwrap();
-    assert!(
-        matches!(&refused, RecordError::Preroll { path, .. } if *path == folder),
-        "{refused:?}"
-    );
+    let RecordError::Preroll { path, .. } = &refused else { panic!("{refused:?}") };
+    assert_eq!(*path, folder);
     fs::remove_file(folder).unwrap();
 }
 
@@ -217,31 +204,23 @@ fn on_a_full_disk_the_oldest_entries_are_dropped_without_error() {
         }
         let mut at = 50;
         while folder.join(format!("{}.chunk", full.end - 1)).symlink_metadata().is_ok() {
-            preroll
-                .push(held(1, at), &vec![at as u8; bytes], &mut |held| gone.push(held.at_ns))
-                .unwrap();
+            let mut note = |held: &EntryMeta| gone.push(held.at_ns);
+            preroll.push(held(1, at), &vec![at as u8; bytes], &mut note).unwrap();
             at += 1;
         }
         // There is room again.
         let last = at + 5;
         for at in at..=last {
-            preroll
-                .push(held(1, at), &vec![at as u8; bytes], &mut |held| gone.push(held.at_ns))
-                .unwrap();
+            let mut note = |held: &EntryMeta| gone.push(held.at_ns);
+            preroll.push(held(1, at), &vec![at as u8; bytes], &mut note).unwrap();
         }
         let all = everything(&mut preroll);
-        assert!(
-            all.len() >= 5
-                && all
-                    .iter()
-                    .all(|(held, bytes)| bytes.iter().all(|byte| *byte == held.at_ns as u8))
-        );
+        let is_right = |(held, bytes): &(EntryMeta, Vec<u8>)| {
+            bytes.iter().all(|byte| *byte == held.at_ns as u8)
+        };
+        assert!(all.len() >= 5 && all.iter().all(is_right));
         let stamps = gone.iter().copied().chain(all.iter().map(|(held, _)| held.at_ns));
-        assert_eq!(
-            stamps.collect::<Vec<_>>(),
-            (0..=last).collect::<Vec<_>>(),
-            "each is kept or was reported"
-        );
+        assert!(stamps.eq(0..=last), "each is kept or was reported");
         preroll.trim(last + 1, &mut |_| {}).unwrap();
     }
 }

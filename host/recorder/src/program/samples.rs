@@ -4,7 +4,10 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 use gleaner_feed::FedTopic;
-use gleaner_transport::{SampleMeta, StoredMeta, TopicCounters, live_definitions};
+use gleaner_transport::{SampleMeta, StoredMeta, TopicCounters};
+
+/// Number of the layout of a live sample whose writer announces none.
+const UNANNOUNCED: u16 = 0;
 
 /// Attempts to find a sample that stays until it is looked at: the ingress publishes meanwhile.
 const ATTEMPTS: u32 = 8;
@@ -43,12 +46,36 @@ impl FedSamples {
 
     /// Returns the definitions to use: those of a recording, `local` ones, or those of nodes.
     pub fn definitions(&self, local: Option<Arc<str>>) -> Option<Arc<str>> {
-        let carried = || self.fed.info.definitions.as_deref().map(Arc::from);
-        let info = &self.fed.info;
-        if info.is_recorded {
-            return carried().or(local);
+        self.fed.definitions(|| local)
+    }
+
+    /// The layout that writers announce, as far as it is known.
+    pub fn type_hash(&self) -> Option<&str> {
+        self.fed.info.type_hash.as_deref()
+    }
+
+    /// Returns whether the next sample has an announced layout that is not known.
+    pub fn lacks_layout(&mut self) -> bool {
+        if self.look().is_none() || self.fed.info.is_recorded || self.type_hash().is_some() {
+            return false;
         }
-        live_definitions(&info.type_name, info.type_hash.as_deref(), local, carried())
+        let words = self.fed.reader.meta(self.next);
+        words.is_some_and(|words| StoredMeta::of_words(&words).sample.layout != UNANNOUNCED)
+    }
+
+    /// Sets the layout that writers announce. Without one, no definitions fit.
+    pub fn set_layout(&mut self, type_hash: Option<String>) {
+        self.fed.info.type_hash = Some(type_hash.unwrap_or_default());
+        // Those that came without a layout.
+        self.fed.info.definitions = None;
+    }
+
+    /// Returns the number of the layout of the next samples in a clip whose definitions have the
+    /// layout `described`; `None` if their own is to be used: of a recording, or where a layout
+    /// has no definitions.
+    pub fn layout_as(&self, described: Option<&str>) -> Option<u16> {
+        let is_it = self.type_hash().is_none() || self.type_hash() == described;
+        (!self.fed.info.is_recorded && is_it).then_some(0)
     }
 
     pub fn offered_qos(&self) -> Option<&str> {
@@ -111,7 +138,8 @@ impl FedSamples {
         let (mut samples, mut bytes) = (0, 0);
         for sample in held.iter() {
             let meta = StoredMeta::of_words(sample.meta()).sample;
-            if meta.at_ns > until_ns {
+            let is_known = self.fed.info.is_recorded || self.fed.info.type_hash.is_some();
+            if meta.at_ns > until_ns || meta.layout != UNANNOUNCED && !is_known {
                 self.ahead = Some(meta.at_ns);
                 break;
             }

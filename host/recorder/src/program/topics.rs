@@ -11,7 +11,7 @@ use gleaner_feed::{FedTopic, FeedError, FeedEvent, LastingFeed};
 use gleaner_protocol::ReceptionGaps;
 use gleaner_protocol::ingress::{ReceptionStatus, RefusedTopic, SourceStatus};
 use gleaner_protocol::link::{COMMANDS_ID, RecordedTopic};
-use gleaner_transport::same_type;
+use gleaner_transport::{SampleMeta, same_type};
 use tracing::{error, warn};
 
 use super::background::DefinitionsRequest;
@@ -27,6 +27,8 @@ const BYTES_TURN: usize = 256 << 10;
 enum Description {
     /// It is searched in the folders of this machine.
     Searched,
+    /// The definitions of this machine are found. The first sample decides if they fit.
+    Found,
     /// It is not there: the ingress is asked once the topic has a sample, and so a writer.
     Unknown,
     /// The ingress was asked.
@@ -52,6 +54,12 @@ struct FedRecording {
     since_ns: i64,
     /// True once lost samples were logged.
     is_warned: bool,
+    /// Definitions on this machine, until the layout of the first sample is known.
+    local: Option<Arc<str>>,
+    /// Time at which the ingress was asked for the layout.
+    layout_asked: Option<Instant>,
+    /// Layout of the definitions that the recorder has.
+    described: Option<String>,
 }
 
 /// A recorded topic.
@@ -124,6 +132,13 @@ impl Topics {
                         fed.description = Description::Known(text.map(Arc::from));
                     }
                 }
+                FeedEvent::Layout { id, type_hash } => {
+                    if let Some(fed) = self.fed(id)
+                        && fed.layout_asked.take().is_some()
+                    {
+                        fed.samples.set_layout(type_hash);
+                    }
+                }
             }
         }
         Ok(commands)
@@ -132,10 +147,8 @@ impl Topics {
     /// Takes the result of a search on this machine.
     pub fn found_locally(&mut self, id: u32, text: Option<Arc<str>>) {
         if let Some(fed) = self.fed(id) {
-            fed.description = match fed.samples.definitions(text) {
-                Some(text) => Description::Known(Some(text)),
-                None => Description::Unknown,
-            };
+            fed.local = text;
+            fed.description = Description::Found;
         }
     }
 
@@ -171,9 +184,11 @@ impl Topics {
             else {
                 return Ok(false);
             };
-            let taken = fed
-                .samples
-                .read(until_ns, most - samples, |meta, cdr| recorder.sample(*topic, meta, cdr))?;
+            let layout = fed.samples.layout_as(fed.described.as_deref());
+            let taken = fed.samples.read(until_ns, most - samples, |meta, cdr| {
+                let meta = SampleMeta { layout: layout.unwrap_or(meta.layout), ..*meta };
+                recorder.sample(*topic, &meta, cdr)
+            })?;
             (samples, bytes) = (samples + taken.0, bytes + taken.1);
             match self.look(index) {
                 Some(at_ns) => stamps[place].0 = at_ns,
@@ -219,6 +234,9 @@ impl Topics {
             description: Description::Searched,
             since_ns,
             is_warned: false,
+            local: None,
+            layout_asked: None,
+            described: None,
         }));
     }
 
@@ -250,9 +268,27 @@ impl Topics {
         else {
             return;
         };
+        // That of an ingress that was started again may be another one.
+        if fed.samples.lacks_layout() {
+            match fed.layout_asked {
+                None if self.feed.request_layout(*id).is_ok() => {
+                    fed.layout_asked = Some(Instant::now());
+                }
+                Some(at) if at.elapsed() >= DEFINITIONS_TIMEOUT => fed.samples.set_layout(None),
+                _ => {}
+            }
+        }
         match &fed.description {
             Description::Settled | Description::Searched => return,
-            _ if fed.samples.look().is_none() => return,
+            _ if fed.samples.look().is_none() || fed.samples.lacks_layout() => return,
+            Description::Found => {
+                let local = fed.local.take();
+                fed.description = match fed.samples.definitions(local) {
+                    Some(text) => Description::Known(Some(text)),
+                    None => Description::Unknown,
+                };
+                return self.describe(index, recorder);
+            }
             // The next one is asked.
             Description::Unknown if !self.feed.has_ingress() => return,
             Description::Unknown => {
@@ -284,6 +320,7 @@ impl Topics {
             offered_qos: fed.samples.offered_qos().map(str::to_owned),
         };
         fed.description = Description::Settled;
+        fed.described = fed.samples.type_hash().map(str::to_owned);
         if let Err(why) = recorder.found_topic(*topic, schema, fed.since_ns) {
             error!(error = &why as &dyn std::error::Error, "cannot record a topic");
         }
@@ -297,7 +334,7 @@ impl Topics {
         if !matches!(fed.description, Description::Settled) {
             return None;
         }
-        let stamp = fed.samples.look();
+        let stamp = fed.samples.look().filter(|_| !fed.samples.lacks_layout());
         if fed.samples.missed() > 0 && !std::mem::replace(&mut fed.is_warned, true) {
             let (topic, missed) = (visible(name), fed.samples.missed());
             warn!(%topic, missed, "samples left before the recorder took them");

@@ -2,10 +2,9 @@
 
 use std::collections::VecDeque;
 
-use gleaner_transport::{Gaps, Guid, SampleMeta};
+use gleaner_transport::{Gaps, Guid, LatchRule, LatchedSample, LatchedTopics, SampleMeta};
 
 use super::clips::OpenClip;
-use super::latched::{LatchRule, LatchedSample, LatchedTopic};
 use super::sources::RecordedSources;
 use crate::RecordError;
 use crate::preroll::{EntryMeta, Losses, Preroll};
@@ -24,6 +23,7 @@ pub struct History {
     message_bytes: usize,
     /// By topic.
     topics: Vec<TopicLosses>,
+    latched: LatchedTopics,
     /// Losses of wakes, by lambda.
     wakes: Vec<Losses>,
     /// The first stamp or time.
@@ -49,7 +49,6 @@ struct TopicLosses {
     /// Each writer, with the stamp of its first sample after the last outage: its loss in the
     /// outage is known from that one.
     writers: Vec<(Guid, Option<i64>)>,
-    latched: LatchedTopic,
 }
 
 impl History {
@@ -58,6 +57,7 @@ impl History {
             preroll,
             message_bytes,
             topics: Vec::new(),
+            latched: LatchedTopics::default(),
             wakes: Vec::new(),
             began_at: 0,
             now: None,
@@ -159,9 +159,9 @@ impl History {
         }
     }
 
-    /// Keeps a sample of a latched topic, as long as it stays valid.
+    /// Keeps a sample of a latched topic, as long as it stays valid and there is room.
     pub fn latch(&mut self, topic: usize, sample: LatchedSample, rule: LatchRule, horizon: i64) {
-        self.topics[topic].latched.keep(sample, rule, horizon);
+        self.latched.keep(topic, sample, rule, horizon);
     }
 
     /// Gives a clip the samples from before its begin that were still valid then.
@@ -172,11 +172,9 @@ impl History {
         sources: &RecordedSources,
     ) -> Result<(), RecordError> {
         for topic in sources.topics_of(group) {
-            if let Some(rule) = sources.latch_rule(topic)
-                && clip.takes_latched(topic)
-            {
-                let from = clip.from(group);
-                let (samples, dropped) = self.topics[topic].latched.valid_at(from, rule);
+            let from = clip.from(group);
+            if sources.latch_rule(topic).is_some() && clip.takes_latched(topic, from) {
+                let (samples, dropped) = self.latched.valid_at(topic, from);
                 clip.tally(topic).latched_dropped = dropped;
                 clip.latched(topic, samples, group, sources)?;
             }

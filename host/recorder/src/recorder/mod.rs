@@ -8,7 +8,6 @@
 
 mod clips;
 mod history;
-mod latched;
 mod limits;
 mod live;
 mod settings;
@@ -24,7 +23,7 @@ use gleaner_base::nanoseconds;
 use gleaner_journal::JournalEntry;
 use gleaner_lambda::{Clip, Moment, TriggerKind};
 use gleaner_protocol::RecordingCounts;
-use gleaner_transport::SampleMeta;
+use gleaner_transport::{LatchedSample, SampleMeta};
 
 use crate::RecordError;
 use crate::file::{RecordingFolder, TopicSchema};
@@ -32,7 +31,6 @@ use crate::preroll::{EntryMeta, Preroll};
 use crate::window::{TriggerOutcome, WindowRules};
 use clips::Clips;
 use history::History;
-use latched::LatchedSample;
 use limits::RecorderLimits;
 use sources::RecordedSources;
 use writer::ClipDisk;
@@ -119,13 +117,7 @@ impl Recorder {
     ///
     /// As [`Recorder::add_topic`].
     pub fn add_missing_topic(&mut self, name: &str) -> Result<TopicId, RecordError> {
-        let topic = TopicSchema {
-            name: name.to_owned(),
-            type_name: String::new(),
-            definitions: None,
-            other_definitions: Vec::new(),
-            offered_qos: None,
-        };
+        let topic = TopicSchema { name: name.to_owned(), ..TopicSchema::default() };
         self.add_topic_state(topic, true)
     }
 
@@ -137,6 +129,11 @@ impl Recorder {
         let topic = self.material.sources.add_topic(topic, is_missing)?;
         self.material.history.grow(topic + 1, 0);
         Ok(TopicId::new(topic))
+    }
+
+    /// Adds a sentence on what all clips lack.
+    pub fn note(&mut self, note: String) {
+        self.material.sources.add_note(note);
     }
 
     /// Adds a lambda that records, before its first wake.
@@ -194,7 +191,8 @@ impl Recorder {
         self.pass(meta.at_ns)?;
         self.material.sources.saw(topic);
         // MCAP has no room for times before 1970.
-        let meta = SampleMeta { publish_ns: meta.publish_ns.max(0), ..*meta };
+        // In a clip that is replayed, a latched sample is one like any other.
+        let meta = SampleMeta { publish_ns: meta.publish_ns.max(0), is_latched: false, ..*meta };
         let in_group = self.clips.write(topic, &meta, cdr, &self.material)?;
         if let Some(rule) = self.material.sources.latch_rule(topic) {
             let horizon = self.clips.horizon();

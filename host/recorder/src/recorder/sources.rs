@@ -5,8 +5,8 @@ use std::sync::Arc;
 use gleaner_journal::{Encoder, JournalEntry, JournalHeader};
 use gleaner_lambda::ClipLambda;
 use gleaner_lambda::manifest::RecordSpec;
+use gleaner_transport::{LatchRule, latched_depth};
 
-use super::latched::{LatchRule, latched_depth};
 use super::settings::TopicId;
 use crate::file::TopicSchema;
 use crate::thumbnail::is_image;
@@ -71,15 +71,26 @@ pub struct RecordedSources {
     is_live: bool,
     topics: Vec<SourceTopic>,
     lambdas: Vec<SourceLambda>,
+    /// Sentences about all clips.
+    notes: Vec<String>,
 }
 
 impl RecordedSources {
     pub fn new(clock: String, is_live: bool) -> RecordedSources {
-        RecordedSources { clock, is_live, topics: Vec::new(), lambdas: Vec::new() }
+        let (topics, lambdas, notes) = (Vec::new(), Vec::new(), Vec::new());
+        RecordedSources { clock, is_live, topics, lambdas, notes }
     }
 
     pub fn clock(&self) -> &str {
         &self.clock
+    }
+
+    pub fn add_note(&mut self, note: String) {
+        self.notes.push(note);
+    }
+
+    pub fn notes(&self) -> &[String] {
+        &self.notes
     }
 
     /// Adds a topic; an existing one of the same name is unchanged. Returns its number.

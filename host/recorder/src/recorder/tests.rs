@@ -13,8 +13,7 @@ fn recorder(
 ) -> (Recorder, TopicId, LambdaId) {
     let mut recorder = scratch.recorder(|_| {});
     recorder.set_limits(limits);
-    let a = recorder.add_topic(topic("/a")).unwrap();
-    let lambda = recorder.add_lambda(member("hello", rolls_ms, &[a]));
+    let (a, lambda) = add_hello(&mut recorder, rolls_ms);
     (recorder, a, lambda)
 }
 
@@ -25,11 +24,8 @@ fn wake(recorder: &mut Recorder, lambda: LambdaId, ms: i64) {
 #[test]
 fn a_journal_that_is_too_long_has_no_gap_and_states_what_is_missing() {
     let scratch = TestDir::new();
-    let (mut recorder, a, lambda) = recorder(
-        &scratch,
-        (100, 50, 0),
-        RecorderLimits { part_bytes: 1 << 10, ..RecorderLimits::default() },
-    );
+    let limits = RecorderLimits { part_bytes: 1 << 10, ..RecorderLimits::default() };
+    let (mut recorder, a, lambda) = recorder(&scratch, (100, 50, 0), limits);
     drive(&mut recorder, &[a], (0, 100, 10), &[]);
     (100..140).for_each(|ms| wake(&mut recorder, lambda, ms));
     recorder.finish(T0 + S).unwrap();
@@ -78,11 +74,8 @@ fn the_journals_of_a_clip_are_bounded_together_and_each_states_what_is_missing()
 #[test]
 fn a_clip_lists_as_many_moments_as_it_may_and_counts_all() {
     let scratch = TestDir::new();
-    let (mut recorder, a, lambda) = recorder(
-        &scratch,
-        (100, 50, 0),
-        RecorderLimits { moments: 150, ..RecorderLimits::default() },
-    );
+    let limits = RecorderLimits { moments: 150, ..RecorderLimits::default() };
+    let (mut recorder, a, lambda) = recorder(&scratch, (100, 50, 0), limits);
     drive(&mut recorder, &[a], (0, 100, 10), &[]);
     (100..300).for_each(|ms| wake(&mut recorder, lambda, ms));
     recorder.set_engine(lambda, "Python; model `m`: rten".to_owned());
@@ -101,8 +94,7 @@ fn a_clip_lists_as_many_moments_as_it_may_and_counts_all() {
 
 #[test]
 fn triggers_beyond_the_waiting_limit_are_counted_in_their_clip() {
-    let scratch = TestDir::new();
-    let mut recorder = scratch.recorder(|_| {});
+    let (_scratch, mut recorder) = TestDir::recording();
     recorder.set_limits(RecorderLimits { waiting: 20, ..RecorderLimits::default() });
     let a = recorder.add_topic(topic("/a")).unwrap();
     let noisy = recorder.add_lambda(member("noisy", (5, 0, 0), &[a]));
@@ -128,11 +120,8 @@ fn triggers_beyond_the_waiting_limit_are_counted_in_their_clip() {
 fn a_clip_states_that_its_number_of_triggers_is_unknown() {
     let scratch = TestDir::new();
     // In the cooldown, triggers open no window; the next window reaches back over some of them.
-    let (mut recorder, a, lambda) = recorder(
-        &scratch,
-        (50, 0, 200),
-        RecorderLimits { waiting: 10, ..RecorderLimits::default() },
-    );
+    let limits = RecorderLimits { waiting: 10, ..RecorderLimits::default() };
+    let (mut recorder, a, lambda) = recorder(&scratch, (50, 0, 200), limits);
     drive(&mut recorder, &[a], (0, 1, 1), &[]);
     (100..=300).for_each(|ms| wake(&mut recorder, lambda, ms));
     recorder.finish(T0 + S).unwrap();
@@ -146,11 +135,8 @@ fn a_clip_states_that_its_number_of_triggers_is_unknown() {
 #[test]
 fn a_message_that_is_too_large_for_a_clip_is_counted_by_the_clip_that_covers_it() {
     let scratch = TestDir::new();
-    let (mut recorder, a, lambda) = recorder(
-        &scratch,
-        (100, 100, 0),
-        RecorderLimits { message_bytes: 10, ..RecorderLimits::default() },
-    );
+    let limits = RecorderLimits { message_bytes: 10, ..RecorderLimits::default() };
+    let (mut recorder, a, lambda) = recorder(&scratch, (100, 100, 0), limits);
     for (ms, bytes) in [(50, 11), (60, 10)] {
         recorder.sample(a, &meta(T0 + ms * MS, 1), &[7; 20][..bytes]).unwrap();
     }
@@ -201,8 +187,7 @@ fn a_lambda_that_triggers_in_every_wake_visits_only_new_entries() {
 /// different prerolls. With `forgets`, all entries are visited in every wake.
 fn random_drive(seed: u64, forgets: bool) -> Vec<Vec<(String, i64, u32)>> {
     let mut random = SeededRandom(seed);
-    let scratch = TestDir::new();
-    let mut recorder = scratch.recorder(|_| {});
+    let (scratch, mut recorder) = TestDir::recording();
     let a = recorder.add_topic(topic("/a")).unwrap();
     let rolls = [(random.below(8), 0), (random.below(300), random.below(20))];
     let lambdas = [0, 1]
@@ -239,8 +224,7 @@ fn visiting_only_new_entries_misses_nothing() {
 
 #[test]
 fn a_topic_with_a_long_description_is_refused() {
-    let scratch = TestDir::new();
-    let mut recorder = scratch.recorder(|_| {});
+    let (_scratch, mut recorder) = TestDir::recording();
     let long = "x".repeat(64 << 10);
     let named = TopicSchema { name: long.clone(), ..topic("/a") };
     let typed = TopicSchema { type_name: long.clone(), ..topic("/a") };
@@ -249,10 +233,8 @@ fn a_topic_with_a_long_description_is_refused() {
         [(named, "name"), (typed, "type name"), (defined, "definitions and quality of service")]
     {
         let error = recorder.add_topic(topic).unwrap_err();
-        assert!(
-            matches!(&error, RecordError::LongTopic { what: found, .. } if *found == what),
-            "{error:?}"
-        );
+        let RecordError::LongTopic { what: found, .. } = &error else { panic!("{error:?}") };
+        assert_eq!(*found, what);
         assert!(error.to_string().len() < 300);
     }
     assert!(recorder.add_missing_topic(&long).is_err());

@@ -3,19 +3,7 @@
 use gleaner_lambda::TriggerKind::{self, Event, Start, Stop};
 
 use super::*;
-
-/// Pseudo-random numbers, the same in each run (SplitMix64).
-struct SeededRandom(u64);
-
-impl SeededRandom {
-    fn below(&mut self, n: u64) -> i64 {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        ((z ^ (z >> 31)) % n) as i64
-    }
-}
+use crate::support::{ModelWindow, SeededRandom, model_groups};
 
 fn rules(preroll_ns: i64, postroll_ns: i64, cooldown_ns: i64) -> WindowRules {
     WindowRules { preroll_ns, postroll_ns, cooldown_ns }
@@ -54,7 +42,12 @@ fn groups(windows: &mut Windows, triggers: &[(i64, TriggerKind)]) -> Vec<(i64, i
     }
     windows.pass(LONG);
     finished.extend(drain(windows));
-    finished.iter().map(|group| (group.begin, group.to)).collect()
+    spans(&finished)
+}
+
+/// Returns the begins and ends of groups.
+fn spans(groups: &[Group]) -> Vec<(i64, i64)> {
+    groups.iter().map(|group| (group.begin, group.to)).collect()
 }
 
 #[test]
@@ -68,11 +61,8 @@ fn overlapping_windows_share_a_clip_and_others_do_not() {
     ];
     for (anchors, expected) in cases {
         let triggers: Vec<_> = anchors.iter().map(|at| (*at, Event)).collect();
-        assert_eq!(
-            groups(&mut machine(LONG, &[rules(5, 5, 0)]), &triggers),
-            expected,
-            "{anchors:?}"
-        );
+        let found = groups(&mut machine(LONG, &[rules(5, 5, 0)]), &triggers);
+        assert_eq!(found, expected, "{anchors:?}");
     }
 }
 
@@ -121,16 +111,10 @@ fn a_late_window_may_join_two_others() {
     }
     windows.pass(1000);
     let finished = drain(&mut windows);
-    assert_eq!(
-        finished.iter().map(|group| (group.begin, group.to)).collect::<Vec<_>>(),
-        [(90, 141)]
-    );
+    assert_eq!(spans(&finished), [(90, 141)]);
+    // Only the windows of lambda 0 are covered for it.
     let covered: Vec<_> = (80..130).filter(|at| finished[0].covers(0, *at)).collect();
-    assert_eq!(
-        covered,
-        [99, 100, 101, 119, 120, 121],
-        "only the windows of lambda 0 are covered for it"
-    );
+    assert_eq!(covered, [99, 100, 101, 119, 120, 121]);
 }
 
 #[test]
@@ -141,7 +125,7 @@ fn a_late_trigger_before_the_open_clip_makes_a_separate_clip() {
     assert_eq!(drain(&mut windows), []);
     windows.trigger(1, Event, "x", 60);
     let late = drain(&mut windows);
-    assert_eq!(late.iter().map(|group| (group.begin, group.to)).collect::<Vec<_>>(), [(58, 62)]);
+    assert_eq!(spans(&late), [(58, 62)]);
     windows.trigger(1, Event, "x", 93);
     assert_eq!(drain(&mut windows), []);
     assert_eq!(windows.open().map(|group| (group.begin, group.from)), Some((91, 91)));
@@ -170,10 +154,8 @@ fn a_long_clip_is_split_without_a_gap() {
         while let Some(step) = windows.step() {
             let WindowStep::Roll { boundary, before } = step else { panic!("{step:?}") };
             assert_eq!((now, before.from + 100), (boundary + 1, boundary));
-            assert_eq!(
-                windows.open().map(|group| (group.from, group.windows(0))),
-                Some((boundary + 1, 1))
-            );
+            let open = windows.open().map(|group| (group.from, group.windows(0)));
+            assert_eq!(open, Some((boundary + 1, 1)));
             boundaries.push(boundary);
         }
     }
@@ -193,49 +175,6 @@ fn extreme_times_do_not_overflow() {
     assert!(windows.close().is_some());
 }
 
-/// A window of the model: lambda, first and last instant.
-type Plain = (usize, i64, i64);
-
-/// Computes the groups by a simple model: all windows at once, then the connected ones. It has no
-/// state, and ignores the order of arrival.
-fn model(rules: &[WindowRules], triggers: &[(i64, usize, TriggerKind)]) -> Vec<Vec<Plain>> {
-    let mut windows: Vec<Plain> = Vec::new();
-    for (lambda, rules) in rules.iter().enumerate() {
-        let mut opened_at = None;
-        let mut started: Option<i64> = None;
-        for (at, _, kind) in triggers.iter().filter(|(_, owner, _)| *owner == lambda) {
-            let cool = opened_at.is_none_or(|opened: i64| *at >= opened + rules.cooldown_ns);
-            match (kind, started) {
-                (Stop, Some(from)) => {
-                    windows.push((lambda, from, at + rules.postroll_ns));
-                    started = None;
-                }
-                (Event, _) if cool => {
-                    windows.push((lambda, at - rules.preroll_ns, at + rules.postroll_ns));
-                    opened_at = Some(*at);
-                }
-                (Start, None) if cool => {
-                    started = Some(at - rules.preroll_ns);
-                    opened_at = Some(*at);
-                }
-                _ => {}
-            }
-        }
-        windows.extend(started.map(|from| (lambda, from, i64::MAX)));
-    }
-    windows.sort_by_key(|(_, from, _)| *from);
-    let mut groups: Vec<Vec<Plain>> = Vec::new();
-    let mut end = i64::MIN;
-    for window in windows {
-        match groups.last_mut() {
-            Some(group) if window.1 <= end => group.push(window),
-            _ => groups.push(vec![window]),
-        }
-        end = end.max(window.2);
-    }
-    groups
-}
-
 #[test]
 fn random_triggers_give_the_groups_of_the_model() {
     for seed in 0..3_000 {
@@ -251,10 +190,8 @@ fn random_triggers_give_the_groups_of_the_model() {
                 match step {
                     WindowStep::Finish(group) => finished.push(*group),
                     WindowStep::Begin(new) | WindowStep::Join { windows: new, .. } => {
-                        assert!(
-                            new.iter().all(|window| window.from >= trimmed),
-                            "a needed entry was dropped: {seed}"
-                        );
+                        let is_kept = new.iter().all(|window| window.from >= trimmed);
+                        assert!(is_kept, "a needed entry was dropped: {seed}");
                     }
                     step => panic!("{step:?}"),
                 }
@@ -282,26 +219,20 @@ fn random_triggers_give_the_groups_of_the_model() {
             finished.push(group);
             finished.extend(drain(&mut windows));
         }
-        let expected = model(&rules, &triggers);
-        let spans =
-            |group: &Vec<Plain>| (group[0].1, group.iter().map(|window| window.2).max().unwrap());
-        let found: Vec<_> = finished.iter().map(|group| (group.begin, group.to)).collect();
-        assert_eq!(
-            found,
-            expected.iter().map(spans).collect::<Vec<_>>(),
-            "seed {seed}: {rules:?} {triggers:?}"
-        );
+        let rolls = rules.iter().map(|of| (of.preroll_ns, of.postroll_ns, of.cooldown_ns));
+        let expected = model_groups(&rolls.collect::<Vec<_>>(), &triggers);
+        let end = |group: &[ModelWindow]| group.iter().map(|window| window.2).max().unwrap();
+        let span = |group: &Vec<ModelWindow>| (group[0].1, end(group));
+        let wanted: Vec<_> = expected.iter().map(span).collect();
+        assert_eq!(spans(&finished), wanted, "seed {seed}: {rules:?} {triggers:?}");
         for (group, expected) in finished.iter().zip(&expected) {
             for lambda in 0..lambdas {
                 let own: Vec<_> = expected.iter().filter(|window| window.0 == lambda).collect();
                 assert_eq!(group.windows(lambda), own.len() as u64, "seed {seed}");
                 for at in 0..now + 100 {
                     let covered = own.iter().any(|(_, from, to)| (*from..=*to).contains(&at));
-                    assert_eq!(
-                        group.covers(lambda, at),
-                        covered,
-                        "seed {seed}, lambda {lambda} at {at}"
-                    );
+                    let found = group.covers(lambda, at);
+                    assert_eq!(found, covered, "seed {seed}, lambda {lambda} at {at}");
                 }
             }
         }
@@ -310,8 +241,7 @@ fn random_triggers_give_the_groups_of_the_model() {
 
 #[test]
 fn a_stop_ends_the_recording_of_its_label_and_the_clip_lasts_until_the_last() {
-    let mut windows = Windows::new(1_000_000);
-    windows.add(WindowRules { preroll_ns: 5, postroll_ns: 5, cooldown_ns: 0 });
+    let mut windows = machine(1_000_000, &[rules(5, 5, 0)]);
     windows.pass(100);
     assert_eq!(windows.trigger(0, Start, "a", 100), TriggerOutcome::Opened);
     assert!(matches!(windows.step(), Some(WindowStep::Begin(_))));
@@ -324,17 +254,16 @@ fn a_stop_ends_the_recording_of_its_label_and_the_clip_lasts_until_the_last() {
     assert_eq!(windows.open().map(|group| (group.from, group.to)), Some((95, 135)));
 }
 
+fn count_opened(outcomes: &[TriggerOutcome]) -> usize {
+    outcomes.iter().filter(|outcome| **outcome == TriggerOutcome::Opened).count()
+}
+
 #[test]
 fn the_number_of_recordings_that_a_lambda_starts_is_bounded() {
-    let mut windows = Windows::new(1_000_000);
-    windows.add(WindowRules { preroll_ns: 5, postroll_ns: 5, cooldown_ns: 0 });
-    let outcomes = (0..STARTED_MAX + 1)
-        .map(|n| windows.trigger(0, Start, &n.to_string(), 100))
-        .collect::<Vec<_>>();
-    assert_eq!(
-        outcomes.iter().filter(|outcome| **outcome == TriggerOutcome::Opened).count(),
-        STARTED_MAX
-    );
+    let mut windows = machine(1_000_000, &[rules(5, 5, 0)]);
+    let outcomes: Vec<_> =
+        (0..=STARTED_MAX).map(|n| windows.trigger(0, Start, &n.to_string(), 100)).collect();
+    assert_eq!(count_opened(&outcomes), STARTED_MAX);
     assert_eq!(outcomes.last(), Some(&TriggerOutcome::TooManyStarted));
 }
 
@@ -343,10 +272,8 @@ fn windows_beyond_the_waiting_limit_are_refused() {
     let mut windows = machine(LONG, &[rules(0, 0, 0)]);
     let outcomes: Vec<_> = (0..4097).map(|n| windows.trigger(0, Event, "x", 10 * n)).collect();
     assert!(outcomes[..4096].iter().all(|outcome| *outcome == TriggerOutcome::Opened));
-    assert_eq!(
-        (outcomes[4096], windows.trigger(0, Start, "y", 100_000)),
-        (TriggerOutcome::TooManyWaiting, TriggerOutcome::TooManyWaiting)
-    );
+    let expected = (TriggerOutcome::TooManyWaiting, TriggerOutcome::TooManyWaiting);
+    assert_eq!((outcomes[4096], windows.trigger(0, Start, "y", 100_000)), expected);
     assert_eq!(windows.forget_waiting(), 4096);
 }
 
@@ -367,10 +294,8 @@ fn clips_wait_for_late_wakes_before_they_end() {
     assert_eq!(drain(&mut windows).len(), 1);
     windows.trigger(0, Start, "x", 2000);
     windows.pass(2090 + 30);
-    assert!(
-        matches!(windows.step(), Some(WindowStep::Begin(_))) && windows.step().is_none(),
-        "it is full, and waits"
-    );
+    assert!(matches!(windows.step(), Some(WindowStep::Begin(_))));
+    assert_eq!(windows.step(), None, "it is full, and waits");
     windows.pass(2091 + 30);
     assert!(matches!(windows.step(), Some(WindowStep::Roll { boundary: 2090, .. })));
     // A late clip is one that nothing can join any more.
@@ -403,10 +328,7 @@ fn commands_and_triggers_end_only_what_is_their_own() {
     assert!(!windows.end(0, 1401));
     assert_eq!(windows.command(0, Stop, "b", 1500), TriggerOutcome::Stopped);
     windows.pass(LONG);
-    assert_eq!(
-        drain(&mut windows).iter().map(|group| (group.begin, group.to)).collect::<Vec<_>>(),
-        [(90, 1510)]
-    );
+    assert_eq!(spans(&drain(&mut windows)), [(90, 1510)]);
 }
 
 #[test]
@@ -415,11 +337,7 @@ fn a_lambda_at_its_limit_does_not_block_commands() {
     for n in 0..2 * STARTED_MAX {
         windows.trigger(0, Start, &n.to_string(), 100);
     }
-    let outcomes = (0..STARTED_MAX + 1)
-        .map(|n| windows.command(0, Start, &n.to_string(), 100))
-        .collect::<Vec<_>>();
-    assert_eq!(
-        outcomes.iter().filter(|outcome| **outcome == TriggerOutcome::Opened).count(),
-        STARTED_MAX
-    );
+    let outcomes: Vec<_> =
+        (0..=STARTED_MAX).map(|n| windows.command(0, Start, &n.to_string(), 100)).collect();
+    assert_eq!(count_opened(&outcomes), STARTED_MAX);
 }

@@ -34,10 +34,7 @@ impl CommandedRun {
     }
 
     fn join(&mut self, scratch: &TestDir, name: &str, rolls_ms: (u32, u32)) -> RecorderLink {
-        let (folder, header) = lambda(scratch, name, rolls_ms);
-        let mut link = RecorderLink::new(self.running.add(&add(&folder)).unwrap());
-        link.hello(&header, TIMEOUT).unwrap();
-        link
+        self.running.join(scratch, name, rolls_ms)
     }
 
     /// Publishes a command once there is a reader.
@@ -64,9 +61,8 @@ impl CommandedRun {
         assert_eq!((status.accepted, status.refused), (accepted, refused));
     }
 
-    fn end(mut self) {
-        self.running.starter.control.stop().unwrap();
-        assert_eq!(self.running.ended().1, Ok(()));
+    fn end(self) {
+        assert_eq!(self.running.stopped().1, Ok(()));
     }
 }
 
@@ -94,10 +90,7 @@ fn an_event_by_command_records_like_the_lambda_and_is_in_no_journal() {
     assert_eq!((clip.moments[0].score, clip.moments[0].at_ns), (Some(0.25), at));
     assert_eq!(clip.lambdas[0].windows, 1);
     let numbers: Vec<_> = scratch.messages(&clip).into_iter().map(|(_, _, seq, _)| seq).collect();
-    assert!(
-        numbers.len() > 50 && numbers.windows(2).all(|pair| pair[1] == pair[0] + 1),
-        "{numbers:?}"
-    );
+    assert!(numbers.len() > 50 && follow_each_other(&numbers), "{numbers:?}");
     assert_eq!(scratch.journal(&clip, "first").1, [at_wake], "wakes, and nothing else");
     let metadata = scratch.metadata(&clip);
     let decisions: Vec<_> =
@@ -134,18 +127,17 @@ fn a_stop_ends_what_a_command_started_and_nothing_else() {
     let clip = commanded.running.clip();
     assert!(clip.to_ns >= stopped, "{clip:?}");
     let source = Some(SOURCE);
-    assert_eq!(
-        moments(&clip),
-        [
-            ("first", Start, "here", None),
-            ("second", Start, "here", source),
-            ("second", TriggerKind::Stop, "here", source)
-        ]
-    );
-    assert_eq!(
-        clip.incomplete,
-        ["first ended before its stop trigger", "/b was not published before the clip ended"]
-    );
+    let expected = [
+        ("first", Start, "here", None),
+        ("second", Start, "here", source),
+        ("second", TriggerKind::Stop, "here", source),
+    ];
+    assert_eq!(moments(&clip), expected);
+    let expected = [
+        "first ended before its stop trigger",
+        "no message of /b was received before the clip ended",
+    ];
+    assert_eq!(clip.incomplete, expected);
     commanded.accepted_and_refused(2, 2);
     commanded.end();
 }
@@ -169,10 +161,7 @@ fn too_many_too_long_and_invalid_commands_are_counted_and_do_nothing() {
         commanded.publish(r#"{"command":"event","label":"x"}"#);
     }
     commanded.accepted_and_refused(0, 5 + 10_000);
-    let last = {
-        commanded.running.starter.control.stop().unwrap();
-        commanded.running.ended().0
-    };
+    let (last, _) = commanded.running.stopped();
     assert_eq!(last.recording, RecordingCounts::default());
 }
 
@@ -199,9 +188,7 @@ fn without_the_option_there_are_no_commands() {
     network.add_texts(TOPIC);
     let mut running = Running::start(&scratch, &network, |_| {});
     let _sensor = Sensor::start(&network, running.clock);
-    let (folder, header) = lambda(&scratch, "first", (0, 0));
-    let mut link = RecorderLink::new(running.add(&add(&folder)).unwrap());
-    link.hello(&header, TIMEOUT).unwrap();
+    let _link = running.join(&scratch, "first", (0, 0));
     received(&mut running, 50);
     let text = br#"{"command": "event", "label": "x"}"#;
     assert_eq!(network.publish_text(TOPIC, running.clock.now(), text), None);

@@ -12,7 +12,7 @@ use gleaner_lambda::Clip;
 use gleaner_lambda::TriggerKind::{Event, Start};
 use gleaner_lambda::manifest::Store;
 use gleaner_protocol::link::Loss;
-use gleaner_recorder::{RecordError, RecordingFolder};
+use gleaner_recorder::{RecordError, Recorder, RecordingFolder, Settings};
 
 const PRECIOUS: &str = "precious, and without a newline at its end";
 
@@ -125,18 +125,9 @@ fn a_folder_of_clips_or_of_the_preroll_that_is_a_link_is_refused() {
     let preroll = scratch.0.join("preroll");
     fs::write(elsewhere.0.join("0.chunk"), PRECIOUS).unwrap();
     symlink(&elsewhere.0, &preroll).unwrap();
-    let settings = gleaner_recorder::Settings {
-        store: Store::Disk,
-        preroll_bytes: 16 << 20,
-        max_length: std::time::Duration::from_secs(600),
-        folder: scratch.0.clone(),
-        clock: "log time of the drive".to_owned(),
-        prefault: false,
-    };
-    let refused =
-        gleaner_recorder::Recorder::new(RecordingFolder::open(&scratch.0).unwrap().0, settings)
-            .err()
-            .unwrap();
+    let settings = Settings { store: Store::Disk, ..scratch.settings() };
+    let (folder, _) = RecordingFolder::open(&scratch.0).unwrap();
+    let refused = Recorder::new(folder, settings).err().unwrap();
     assert_refused(refused, &preroll, "it is a link");
     assert!(is_untouched(&elsewhere.0.join("0.chunk")));
     assert_eq!(fs::read_dir(&elsewhere.0).unwrap().count(), 1, "nothing was created there");

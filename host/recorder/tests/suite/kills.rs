@@ -72,10 +72,6 @@ fn numbers(scratch: &TestDir, clip: &Clip) -> Vec<u32> {
     scratch.messages(clip).into_iter().map(|(_, _, seq, _)| seq).collect()
 }
 
-fn follow_each_other(numbers: &[u32]) -> bool {
-    numbers.windows(2).all(|pair| pair[1] == pair[0] + 1)
-}
-
 #[test]
 fn reported_clips_are_complete_and_open_ones_are_recovered_after_any_kill() {
     let usual = if std::env::var("GLEANER_LONG").is_ok_and(|value| value == "1") {
@@ -124,10 +120,8 @@ fn reported_clips_are_complete_and_open_ones_are_recovered_after_any_kill() {
         for clip in &listed {
             let numbers = numbers(&scratch, clip);
             assert!(follow_each_other(&numbers), "kill {kill}: {numbers:?}");
-            assert_eq!(
-                numbers.len() as u64,
-                clip.topics.iter().map(|topic| topic.messages).sum::<u64>()
-            );
+            let messages: u64 = clip.topics.iter().map(|topic| topic.messages).sum();
+            assert_eq!(numbers.len() as u64, messages);
             if clip.recovered.is_none() {
                 let journals =
                     clip.lambdas.iter().map(|lambda| scratch.journal(clip, &lambda.name).1.len());

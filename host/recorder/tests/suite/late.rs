@@ -4,7 +4,6 @@ use std::time::Duration;
 
 use crate::support::*;
 use gleaner_lambda::TriggerKind::{self, Event, Start, Stop};
-use gleaner_lambda::manifest::Store;
 use gleaner_recorder::{LambdaId, Recorder, RecordingFolder, Settings, TopicId};
 
 /// A recorder with one topic and a lambda without preroll, so that nothing waits longer than it
@@ -14,18 +13,11 @@ fn recorder(
     postroll_ms: i64,
     max_length_ms: u64,
 ) -> (Recorder, TopicId, LambdaId) {
-    let settings = Settings {
-        store: Store::Ram,
-        preroll_bytes: 16 << 20,
-        max_length: Duration::from_millis(max_length_ms),
-        folder: scratch.0.clone(),
-        clock: "monotonic".to_owned(),
-        prefault: false,
-    };
-    let mut recorder =
-        Recorder::live(RecordingFolder::open(&scratch.0).unwrap().0, settings).unwrap();
-    let a = recorder.add_topic(topic("/a")).unwrap();
-    let lambda = recorder.add_lambda(member("hello", (0, postroll_ms, 0), &[a]));
+    let max_length = Duration::from_millis(max_length_ms);
+    let settings = Settings { max_length, clock: "monotonic".to_owned(), ..scratch.settings() };
+    let folder = RecordingFolder::open(&scratch.0).unwrap().0;
+    let mut recorder = Recorder::live(folder, settings).unwrap();
+    let (a, lambda) = add_hello(&mut recorder, (0, postroll_ms, 0));
     (recorder, a, lambda)
 }
 
@@ -81,10 +73,8 @@ fn late_wakes_are_in_the_right_clip_of_a_long_recording() {
     let (mut samples, mut wakes) = (Vec::new(), Vec::new());
     for clip in recorder.clips() {
         let journal = scratch.journal(clip, "hello").1;
-        assert!(
-            journal.iter().all(|at| (clip.from_ns..=clip.to_ns).contains(at)),
-            "{clip:?}: {journal:?}"
-        );
+        let span = clip.from_ns..=clip.to_ns;
+        assert!(journal.iter().all(|at| span.contains(at)), "{clip:?}: {journal:?}");
         wakes.extend(journal.iter().map(|at| (at - T0) / MS));
         samples.extend(stamps(&scratch, clip, "/a"));
     }

@@ -16,8 +16,7 @@ fn cut(store: Store, bytes: u64) -> (TestDir, Clip, u64) {
     let scratch = TestDir::new();
     let mut recorder =
         scratch.recorder(|settings| (settings.store, settings.preroll_bytes) = (store, bytes));
-    let a = recorder.add_topic(topic("/a")).unwrap();
-    let lambda = recorder.add_lambda(member("hello", (1000, 100, 0), &[a]));
+    let (a, lambda) = add_hello(&mut recorder, (1000, 100, 0));
     for ms in 0..3000 {
         recorder.sample(a, &meta(T0 + ms * MS, ms as u64), &[ms as u8; 100]).unwrap();
         within_bound(&recorder);
@@ -34,10 +33,8 @@ fn cut(store: Store, bytes: u64) -> (TestDir, Clip, u64) {
 
 fn within_bound(recorder: &Recorder) {
     let counts = recorder.counts();
-    assert!(
-        counts.preroll_bytes <= counts.preroll_highest
-            && counts.preroll_highest <= counts.preroll_bound
-    );
+    assert!(counts.preroll_bytes <= counts.preroll_highest);
+    assert!(counts.preroll_highest <= counts.preroll_bound);
 }
 
 #[test]
@@ -49,18 +46,12 @@ fn evicted_samples_are_counted_in_the_clip_that_lacks_them() {
         assert!(overwritten > 600, "50 kB hold some 290 samples of 100 bytes: {overwritten}");
         assert_eq!((topic.received, topic.messages + overwritten), (Some(1101), 1101));
         assert_eq!(scratch.contents(&clip).len() as u64, topic.messages);
-        assert_eq!(
-            clip.incomplete,
-            [format!(
-                "preroll_size is too small: {overwritten} samples of /a evicted from the preroll"
-            )]
-        );
+        let stated = format!("{overwritten} samples of /a evicted from the preroll");
+        assert_eq!(clip.incomplete, [format!("preroll_size is too small: {stated}")]);
         assert!(evicted_early > overwritten);
         let (_scratch, clip, evicted_early) = cut(store, 16 << 20);
-        assert_eq!(
-            (clip.topics[0].overwritten, evicted_early, clip.incomplete),
-            (Some(0), 0, vec![])
-        );
+        let expected = (Some(0), 0, vec![]);
+        assert_eq!((clip.topics[0].overwritten, evicted_early, clip.incomplete), expected);
     }
 }
 
@@ -68,20 +59,14 @@ fn evicted_samples_are_counted_in_the_clip_that_lacks_them() {
 fn losses_that_cannot_be_counted_are_unknown() {
     let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|settings| settings.preroll_bytes = 10_000);
-    let a = recorder.add_topic(topic("/a")).unwrap();
-    let lambda = recorder.add_lambda(member("hello", (6000, 0, 0), &[a]));
+    let (a, lambda) = add_hello(&mut recorder, (6000, 0, 0));
     drive(&mut recorder, &[a], (0, 6000, 1), &[(5999, lambda, EVENT)]);
     recorder.finish(T0 + 6000 * MS).unwrap();
     let clip = &recorder.clips()[0];
-    assert_eq!(
-        (clip.topics[0].overwritten, clip.topics[0].received, clip.topics[0].too_big),
-        (None, None, Some(0))
-    );
-    assert!(
-        clip.incomplete.iter().any(|short| short.ends_with("more than counted")),
-        "{:?}",
-        clip.incomplete
-    );
+    let topic = &clip.topics[0];
+    assert_eq!((topic.overwritten, topic.received, topic.too_big), (None, None, Some(0)));
+    let is_stated = clip.incomplete.iter().any(|short| short.ends_with("more than counted"));
+    assert!(is_stated, "{:?}", clip.incomplete);
 }
 
 #[test]
@@ -90,8 +75,7 @@ fn a_sample_larger_than_the_store_is_in_an_open_clip_and_counted_before_one() {
         let scratch = TestDir::new();
         let mut recorder =
             scratch.recorder(|settings| (settings.store, settings.preroll_bytes) = (store, 5_000));
-        let a = recorder.add_topic(topic("/a")).unwrap();
-        let lambda = recorder.add_lambda(member("hello", (1000, 1000, 0), &[a]));
+        let (a, lambda) = add_hello(&mut recorder, (1000, 1000, 0));
         recorder.sample(a, &meta(T0 - 1500 * MS, 1), &[0; 10]).unwrap();
         for (ms, bytes) in [(0, 10), (100, 10_000), (200, 10)] {
             recorder.sample(a, &meta(T0 + ms * MS, 2), &vec![1; bytes]).unwrap();
@@ -113,8 +97,7 @@ fn a_sample_larger_than_the_store_is_in_an_open_clip_and_counted_before_one() {
 fn evicted_wakes_are_missing_from_the_journal_and_reported() {
     let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|settings| settings.preroll_bytes = 3_000);
-    let a = recorder.add_topic(topic("/a")).unwrap();
-    let lambda = recorder.add_lambda(member("hello", (1000, 0, 0), &[a]));
+    let (_, lambda) = add_hello(&mut recorder, (1000, 0, 0));
     for ms in 0..100 {
         recorder.wake(lambda, &entry(T0 + ms * MS, if ms == 99 { EVENT } else { &[] })).unwrap();
         within_bound(&recorder);
@@ -122,10 +105,8 @@ fn evicted_wakes_are_missing_from_the_journal_and_reported() {
     recorder.finish(T0 + 3 * S).unwrap();
     let clip = &recorder.clips()[0];
     let (header, wakes) = scratch.journal(clip, "hello");
-    assert_eq!(
-        (header.wakes_before + wakes.len() as u64, wakes.last()),
-        (100, Some(&(T0 + 99 * MS)))
-    );
+    assert_eq!(header.wakes_before + wakes.len() as u64, 100);
+    assert_eq!(wakes.last(), Some(&(T0 + 99 * MS)));
     let stated = format!(
         "the journal of hello lacks {} wakes: evicted from the preroll",
         header.wakes_before
@@ -147,8 +128,6 @@ fn a_preroll_on_disk_is_deleted_at_the_end_and_its_failure_is_reported() {
     let a = recorder.add_topic(topic("/a")).unwrap();
     fs::remove_dir_all(&folder).unwrap();
     let error = recorder.sample(a, &meta(T0, 1), b"x").unwrap_err();
-    assert!(
-        matches!(&error, RecordError::Preroll { path, .. } if path.starts_with(&folder)),
-        "{error:?}"
-    );
+    let RecordError::Preroll { path, .. } = &error else { panic!("{error:?}") };
+    assert!(path.starts_with(&folder), "{error:?}");
 }

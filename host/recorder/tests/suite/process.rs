@@ -21,9 +21,7 @@ use gleaner_transport::Clock;
 #[test]
 fn two_lambdas_record_and_neither_can_act_as_the_other() {
     let scratch = TestDir::new();
-    let network = FakeNetwork::default();
-    network.add("/a");
-    let mut running = Running::start(&scratch, &network, |_| {});
+    let (mut running, network) = Running::start_with_a(&scratch);
     let clock = running.clock;
     let (first, first_header) = lambda(&scratch, "first", (200, 100));
     let (second, second_header) = lambda(&scratch, "second", (50, 300));
@@ -32,10 +30,8 @@ fn two_lambdas_record_and_neither_can_act_as_the_other() {
     // Each link can only act as the lambda of its own socket.
     let refused =
         RecorderLink::new(running.add(&add(&first)).unwrap()).hello(&second_header, TIMEOUT);
-    assert!(
-        matches!(&refused, Err(LinkError::Refused { reason }) if reason.contains("`second`")),
-        "{refused:?}"
-    );
+    let Err(LinkError::Refused { reason }) = refused else { panic!("{refused:?}") };
+    assert!(reason.contains("`second`"), "{reason}");
     one.hello(&first_header, TIMEOUT).unwrap();
     two.hello(&second_header, TIMEOUT).unwrap();
     let sensor = Sensor::start(&network, clock);
@@ -50,20 +46,12 @@ fn two_lambdas_record_and_neither_can_act_as_the_other() {
     }
     assert!(matches!(opened[..], [RecorderMessage::Opened { .. }]), "{opened:?}");
     let clip = running.clip();
-    assert_eq!(
-        clip.lambdas.iter().map(|lambda| lambda.name.as_str()).collect::<Vec<_>>(),
-        ["first"]
-    );
-    assert_eq!(
-        (clip.from_ns, clip.to_ns, clip.triggers),
-        (anchor - 200 * MS, anchor + 100 * MS, 1)
-    );
+    assert_eq!(lambda_names(&clip), ["first"]);
+    let expected = (anchor - 200 * MS, anchor + 100 * MS, 1);
+    assert_eq!((clip.from_ns, clip.to_ns, clip.triggers), expected);
     // Every number from the first to the last, once, and all of that time.
     let numbers: Vec<_> = scratch.messages(&clip).into_iter().map(|(_, _, seq, _)| seq).collect();
-    assert!(
-        numbers.len() > 1 && numbers.windows(2).all(|pair| pair[1] == pair[0] + 1),
-        "{numbers:?}"
-    );
+    assert!(numbers.len() > 1 && follow_each_other(&numbers), "{numbers:?}");
     assert_eq!(numbers, sensor.numbers(clip.from_ns, clip.to_ns));
     let counts: Vec<_> = clip
         .topics
@@ -77,13 +65,10 @@ fn two_lambdas_record_and_neither_can_act_as_the_other() {
     // A lambda that was never built.
     let _unbuilt = running.add(&add(&scratch.0.join("third"))).unwrap();
     running.status(|status| status.lambdas == 0 && status.recording.lambdas_refused == 2);
-    running.starter.control.stop().unwrap();
-    let (last, ended) = running.ended();
+    let (last, ended) = running.stopped();
     assert_eq!(ended, Ok(()));
-    assert_eq!(
-        (last.recording.clips, last.recording.windows, last.trigger_to_open.unwrap().n),
-        (1, 1, 1)
-    );
+    assert_eq!((last.recording.clips, last.recording.windows), (1, 1));
+    assert_eq!(last.trigger_to_open.unwrap().n, 1);
     drop(sensor);
 }
 
@@ -93,14 +78,12 @@ fn a_stopped_recording_keeps_its_clips() {
         let scratch = TestDir::new();
         let network = FakeNetwork::default();
         let mut running = Running::start(&scratch, &network, |_| {});
-        let (folder, header) = lambda(&scratch, "first", (100, 60_000));
-        let mut link = RecorderLink::new(running.add(&add(&folder)).unwrap());
-        link.hello(&header, TIMEOUT).unwrap();
+        let mut link = running.join(&scratch, "first", (100, 60_000));
         // A topic that appears later is found.
         network.add("/a");
         let _sensor = Sensor::start(&network, running.clock);
         received(&mut running, 10);
-        link.wake(&entry(running.clock.now(), &[Event]), monotonic(running.clock)).unwrap();
+        running.event(&mut link);
         running.status(|status| status.is_recording);
         match how {
             "stop" => running.starter.control.stop().unwrap(),
@@ -108,12 +91,8 @@ fn a_stopped_recording_keeps_its_clips() {
             _ => running.starter.control = ControlClient::pair().unwrap().0,
         }
         let clip = running.clip();
-        assert!(
-            clip.incomplete
-                .contains(&"the recording was stopped before the window ended".to_owned()),
-            "{:?}",
-            clip.incomplete
-        );
+        let stated = "the recording was stopped before the window ended";
+        assert!(clip.incomplete.iter().any(|why| why == stated), "{:?}", clip.incomplete);
         assert!(!scratch.messages(&clip).is_empty());
         assert_eq!(running.ended().1, Ok(()), "{how}");
     }
@@ -122,9 +101,7 @@ fn a_stopped_recording_keeps_its_clips() {
 #[test]
 fn messages_of_a_hostile_lambda_do_not_affect_others() {
     let scratch = TestDir::new();
-    let network = FakeNetwork::default();
-    network.add("/a");
-    let mut running = Running::start(&scratch, &network, |_| {});
+    let (mut running, network) = Running::start_with_a(&scratch);
     let clock = running.clock;
     let (honest, honest_header) = lambda(&scratch, "honest", (100, 50));
     let (hostile, hostile_header) = lambda(&scratch, "hostile", (0, 0));
@@ -146,10 +123,8 @@ fn messages_of_a_hostile_lambda_do_not_affect_others() {
     noisy.bye(TIMEOUT);
     let status = running.status(|status| status.recording.triggers_over_rate > 10_000);
     assert_eq!((status.recording.wakes_misstamped, status.recording.triggers_misstamped), (4, 8));
-    assert_eq!(
-        (status.recording.wakes_over_rate, status.recording.ignored),
-        (status.recording.triggers_over_rate, 0)
-    );
+    let expected = (status.recording.triggers_over_rate, 0);
+    assert_eq!((status.recording.wakes_over_rate, status.recording.ignored), expected);
     let anchor = clock.now();
     honest.wake(&entry(anchor, &[Event]), monotonic(clock)).unwrap();
     let clip = running.until(|report| match report {
@@ -160,8 +135,7 @@ fn messages_of_a_hostile_lambda_do_not_affect_others() {
     });
     assert_eq!(clip.topics[0].lost, Some(0));
     assert_eq!(clip.topics[0].overwritten, Some(0));
-    running.starter.control.stop().unwrap();
-    assert_eq!(running.ended().1, Ok(()));
+    assert_eq!(running.stopped().1, Ok(()));
 }
 
 #[test]
@@ -178,14 +152,11 @@ fn the_limits_of_a_vehicle_apply_to_the_manifest_in_the_recorder() {
     let refused =
         RecorderLink::new(running.add(&announced).unwrap()).hello(&as_in_manifest, TIMEOUT);
     let limit = "its limit `fuel` is `50000000`; the starter announced `10000`";
-    assert!(
-        matches!(&refused, Err(LinkError::Refused { reason }) if reason.contains(limit)),
-        "{refused:?}"
-    );
+    let Err(LinkError::Refused { reason }) = refused else { panic!("{refused:?}") };
+    assert!(reason.contains(limit), "{reason}");
     let mut link = RecorderLink::new(running.add(&announced).unwrap());
     link.hello(&on_vehicle, TIMEOUT).unwrap();
-    running.starter.control.stop().unwrap();
-    let (last, ended) = running.ended();
+    let (last, ended) = running.stopped();
     assert_eq!((last.recording.lambdas_refused, ended), (1, Ok(())));
 }
 
@@ -195,12 +166,10 @@ fn a_full_disk_is_reported_and_no_clip_is_begun() {
     let network = FakeNetwork::default();
     network.add("/a");
     let mut running = Running::start(&scratch, &network, |options| options.disk_floor = u64::MAX);
-    let (folder, header) = lambda(&scratch, "first", (10, 10));
-    let mut link = RecorderLink::new(running.add(&add(&folder)).unwrap());
-    link.hello(&header, TIMEOUT).unwrap();
+    let mut link = running.join(&scratch, "first", (10, 10));
     let _sensor = Sensor::start(&network, running.clock);
     running.status(|status| status.disk_free.is_some());
-    link.wake(&entry(running.clock.now(), &[Event]), monotonic(running.clock)).unwrap();
+    running.event(&mut link);
     let triggers = running.until(|report| match report {
         RecorderReport::Loss(Loss::DiskSuppressed { triggers, .. }) => Some(triggers),
         _ => None,
@@ -208,11 +177,10 @@ fn a_full_disk_is_reported_and_no_clip_is_begun() {
     assert_eq!(triggers, 1);
     // Those that follow are reported in one sum, at the end.
     for count in [2, 3] {
-        link.wake(&entry(running.clock.now(), &[Event]), monotonic(running.clock)).unwrap();
+        running.event(&mut link);
         running.status(|status| status.recording.disk_suppressed == count);
     }
-    running.starter.control.stop().unwrap();
-    let (last, ended) = running.ended();
+    let (last, ended) = running.stopped();
     assert_eq!((last.recording.disk_suppressed, last.recording.clips, ended), (3, 0, Ok(())));
     let losses = fs::read_to_string(scratch.0.join("losses.jsonl")).unwrap();
     let losses: Vec<serde_json::Value> =
@@ -250,19 +218,14 @@ fn a_recorder_is_ready_before_it_recovers_and_reports_what_it_cannot_recover() {
         RecorderReport::Loss(Loss::Failed { reason, .. }) => Some(reason),
         _ => None,
     });
-    assert!(
-        why.contains("cannot recover the unfinished clip") && why.contains(".mcap.part2"),
-        "{why}"
-    );
-    let (folder, header) = lambda(&scratch, "first", (10, 10));
-    let mut link = RecorderLink::new(running.add(&add(&folder)).unwrap());
-    link.hello(&header, TIMEOUT).unwrap();
+    assert!(why.contains("cannot recover the unfinished clip"), "{why}");
+    assert!(why.contains(".mcap.part2"), "{why}");
+    let mut link = running.join(&scratch, "first", (10, 10));
     let _sensor = Sensor::start(&network, running.clock);
     received(&mut running, 10);
-    link.wake(&entry(running.clock.now(), &[Event]), monotonic(running.clock)).unwrap();
+    running.event(&mut link);
     assert!(!scratch.messages(&running.clip()).is_empty());
-    running.starter.control.stop().unwrap();
-    let (last, ended) = running.ended();
+    let (last, ended) = running.stopped();
     assert_eq!((last.recording.clips, last.recording.failed, ended), (1, 1, Ok(())));
     assert!(fs::read_to_string(scratch.0.join("losses.jsonl")).unwrap().contains("cannot recover"));
     assert_eq!(fs::read(part).unwrap(), left);
@@ -277,10 +240,8 @@ fn a_recorder_is_ready_before_it_recovers_and_reports_what_it_cannot_recover() {
     });
     assert!(recovered.recovered.is_some() && recovered.lambdas[0].name == "dead");
     let (last, ended) = running.ended();
-    assert_eq!(
-        (last.recording.clips, last.recording.failed, last.recording.deleted, ended),
-        (0, 0, 1, Ok(()))
-    );
+    assert_eq!((last.recording.clips, last.recording.failed), (0, 0));
+    assert_eq!((last.recording.deleted, ended), (1, Ok(())));
     assert_eq!(find(".mcap"), [scratch.0.join(&recovered.file)]);
 }
 
@@ -290,9 +251,7 @@ fn a_topic_is_recorded_with_the_type_of_the_input_whichever_writer_came_first() 
     let network = FakeNetwork::default();
     network.add_other("/a", "aaa/msg/X");
     let mut running = Running::start(&scratch, &network, |_| {});
-    let (folder, header) = lambda(&scratch, "first", (10, 10));
-    let mut link = RecorderLink::new(running.add(&add(&folder)).unwrap());
-    link.hello(&header, TIMEOUT).unwrap();
+    let _link = running.join(&scratch, "first", (10, 10));
     network.add("/a");
     let _sensor = Sensor::start(&network, running.clock);
     received(&mut running, 10);
@@ -310,10 +269,8 @@ fn one_lambda_too_many_is_refused_with_a_reason_and_the_others_work() {
     let sockets: Vec<_> = (0..256).map(|_| running.add(&add(&folder)).unwrap()).collect();
     let mut last = RecorderLink::new(running.add(&add(&folder)).unwrap());
     let refused = last.hello(&header, TIMEOUT).unwrap_err();
-    assert_eq!(
-        refused.to_string(),
-        "the recorder refuses the lambda: it records for at most 256 lambdas at a time"
-    );
+    let expected = "the recorder refuses the lambda: it records for at most 256 lambdas at a time";
+    assert_eq!(refused.to_string(), expected);
     running.status(|status| (status.lambdas, status.recording.lambdas_refused) == (256, 1));
     let mut links = sockets.into_iter().map(RecorderLink::new);
     links.next_back().unwrap().hello(&header, TIMEOUT).unwrap();

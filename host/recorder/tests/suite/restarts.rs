@@ -5,7 +5,7 @@ use crate::running::*;
 use crate::support::*;
 use gleaner_base::Exit;
 use gleaner_lambda::TriggerKind::Event;
-use gleaner_protocol::link::{RecorderLink, RecorderStatus};
+use gleaner_protocol::link::RecorderStatus;
 
 fn lost(status: &RecorderStatus) -> Option<u64> {
     status.topics.iter().find(|topic| topic.topic == "/a").and_then(|topic| topic.lost)
@@ -14,13 +14,9 @@ fn lost(status: &RecorderStatus) -> Option<u64> {
 #[test]
 fn a_clip_goes_on_while_the_ingress_is_started_again_and_states_what_is_missing() {
     let scratch = TestDir::new();
-    let network = FakeNetwork::default();
-    network.add("/a");
-    let mut running = Running::start(&scratch, &network, |_| {});
+    let (mut running, network) = Running::start_with_a(&scratch);
     let clock = running.clock;
-    let (folder, header) = lambda(&scratch, "first", (10_000, 60_000));
-    let mut link = RecorderLink::new(running.add(&add(&folder)).unwrap());
-    link.hello(&header, TIMEOUT).unwrap();
+    let mut link = running.join(&scratch, "first", (10_000, 60_000));
     let sensor = Sensor::start(&network, clock);
     received(&mut running, 300);
     link.wake(&entry(clock.now(), &[Event]), monotonic(clock)).unwrap();
@@ -54,15 +50,11 @@ fn a_clip_goes_on_while_the_ingress_is_started_again_and_states_what_is_missing(
 #[test]
 fn a_recorder_whose_ingress_and_starter_have_ended_completes_its_clips() {
     let scratch = TestDir::new();
-    let network = FakeNetwork::default();
-    network.add("/a");
-    let mut running = Running::start(&scratch, &network, |_| {});
-    let (folder, header) = lambda(&scratch, "first", (10_000, 60_000));
-    let mut link = RecorderLink::new(running.add(&add(&folder)).unwrap());
-    link.hello(&header, TIMEOUT).unwrap();
+    let (mut running, network) = Running::start_with_a(&scratch);
+    let mut link = running.join(&scratch, "first", (10_000, 60_000));
     let _sensor = Sensor::start(&network, running.clock);
     received(&mut running, 300);
-    link.wake(&entry(running.clock.now(), &[Event]), monotonic(running.clock)).unwrap();
+    running.event(&mut link);
     running.status(|status| status.is_recording);
     running.starter.end_handover();
     running.starter.end_ingress(&network);

@@ -64,45 +64,14 @@ type Contents = Vec<(String, i64, u32)>;
 
 /// The contents of each clip, by brute force.
 fn expected(plan: &Plan) -> Vec<Contents> {
-    let mut windows: Vec<(usize, i64, i64)> = Vec::new();
-    for (lambda, ((preroll, postroll, cooldown), _)) in plan.lambdas.iter().enumerate() {
-        let (mut opened, mut started) = (None, None);
-        for (at, _, kind) in plan.triggers.iter().filter(|(_, owner, _)| *owner == lambda) {
-            let cool = opened.is_none_or(|opened: i64| *at >= opened + cooldown);
-            match (kind, started) {
-                (Stop, Some(from)) => {
-                    windows.push((lambda, from, at + postroll));
-                    started = None;
-                }
-                (Event, _) if cool => {
-                    windows.push((lambda, at - preroll, at + postroll));
-                    opened = Some(*at);
-                }
-                (Start, None) if cool => {
-                    started = Some(at - preroll);
-                    opened = Some(*at);
-                }
-                _ => {}
-            }
-        }
-        windows.extend(started.map(|from| (lambda, from, i64::MAX)));
-    }
-    windows.sort_by_key(|(_, from, _)| *from);
-    let mut groups: Vec<Vec<(usize, i64, i64)>> = Vec::new();
-    let mut end = i64::MIN;
-    for window in windows {
-        match groups.last_mut() {
-            Some(group) if window.1 <= end => group.push(window),
-            _ => groups.push(vec![window]),
-        }
-        end = end.max(window.2);
-    }
-    let holds = |group: &[(usize, i64, i64)], topic: usize, at: i64| {
+    let rolls: Vec<_> = plan.lambdas.iter().map(|(rolls, _)| *rolls).collect();
+    let groups = model_groups(&rolls, &plan.triggers);
+    let holds = |group: &[ModelWindow], topic: usize, at: i64| {
         group.iter().any(|(lambda, from, to)| {
             plan.lambdas[*lambda].1.contains(&topic) && *from <= at && at <= *to
         })
     };
-    let contents = |group: &Vec<(usize, i64, i64)>| {
+    let contents = |group: &Vec<ModelWindow>| {
         let inside =
             plan.samples.iter().enumerate().filter(|(_, (topic, at))| holds(group, *topic, *at));
         let mut inside: Vec<_> = inside
@@ -146,10 +115,8 @@ fn recorded(plan: &Plan, store: Store, max_length: Duration) -> Vec<(Contents, V
         contents.iter().for_each(|(topic, _, _)| *counted.entry(topic.clone()).or_insert(0) += 1);
         for topic in &clip.topics {
             let messages = counted.remove(&topic.topic).unwrap_or(0);
-            assert_eq!(
-                (topic.messages, topic.received, topic.overwritten),
-                (messages, Some(messages), Some(0))
-            );
+            let expected = (messages, Some(messages), Some(0));
+            assert_eq!((topic.messages, topic.received, topic.overwritten), expected);
         }
         assert!(counted.is_empty(), "a topic that the clip does not list: {counted:?}");
         (contents, clip.incomplete.clone())
@@ -174,11 +141,8 @@ fn clips_of_random_drives_equal_those_by_brute_force() {
 fn clips_from_memory_and_from_disk_are_equal() {
     for seed in 100..120 {
         let (plan, max_length) = (plan(seed), Duration::from_millis(700));
-        assert_eq!(
-            recorded(&plan, Store::Ram, max_length),
-            recorded(&plan, Store::Disk, max_length),
-            "seed {seed}"
-        );
+        let [ram, disk] = [Store::Ram, Store::Disk].map(|store| recorded(&plan, store, max_length));
+        assert_eq!(ram, disk, "seed {seed}");
     }
 }
 

@@ -1,5 +1,6 @@
 //! Converts a trap to a fault with a named cause.
 
+use gleaner_base::grouped;
 use gleaner_lambda::{Fault, FaultKind};
 use wasmtime::component::ResourceTableError;
 use wasmtime::{Trap, WasmBacktrace};
@@ -15,7 +16,8 @@ use crate::api::fuel::OutOfFuel;
 const TOO_MUCH_DATA: &str = "too much data is being copied between the host and the guest";
 
 pub(super) fn fuel(used: u64, allowed: u64) -> Fault {
-    let message = format!("used {used} of {allowed} units of fuel");
+    let [u, a] = [used, allowed].map(grouped);
+    let message = format!("used {u} units of fuel; [limits] allows {a}: do less, or raise it");
     Fault { kind: FaultKind::Fuel, message, used: Some(used), allowed: Some(allowed) }
 }
 
@@ -24,6 +26,15 @@ pub(super) fn deadline(time: Option<(u64, u64)>) -> Fault {
     let ms = |ns: Option<u64>| ns.unwrap_or(0) as f64 / 1e6;
     let message = format!("ran {:.1} ms; the deadline is {:.1} ms", ms(used), ms(allowed));
     Fault { kind: FaultKind::Deadline, message, used, allowed }
+}
+
+fn memory(&RefusedGrowth { limit, requested, allowed }: &RefusedGrowth) -> Fault {
+    let [most, allows] = [requested, allowed].map(|amount| match limit {
+        "memory" => format!("{:.1} MiB", amount as f64 / 1_048_576.0),
+        _ => grouped(amount),
+    });
+    let message = format!("asked for {most}; `{limit}` in [limits] allows {allows}");
+    Fault { kind: FaultKind::Memory, message, used: Some(requested), allowed: Some(allowed) }
 }
 
 /// Converts an error of a call. The pairs are fuel, and time in ns: used and allowed.
@@ -97,25 +108,31 @@ pub(super) fn from_error(
     let aborted = starting || trap == Some(&Trap::UnreachableCodeReached);
     let for_memory =
         printed.as_ref().is_none_or(|printed| printed.contains("memory allocation of"));
-    if let Some(RefusedGrowth { what, requested, allowed }) =
-        hosted.caps.refused().filter(|_| aborted && for_memory)
-    {
-        let message = format!("asked for {requested} {what}; {allowed} are allowed");
-        return Fault {
-            kind: FaultKind::Memory,
-            message,
-            used: Some(requested),
-            allowed: Some(allowed),
-        };
+    if let Some(refused) = hosted.caps.refused().filter(|_| aborted && for_memory) {
+        return memory(&refused);
     }
     match trap {
         // A compiler's own stack is at the low end of `memory`, and a deep recursion goes below it.
         Some(trap @ Trap::MemoryOutOfBounds) if printed.is_none() => plain(
             FaultKind::Trap,
-            format!("{trap}; perhaps its stack is exhausted by a deep recursion"),
+            format!("{trap}; perhaps its stack is full: a deep recursion, or a large array"),
         ),
         // A panic prints its reason to standard error; the trap has none.
-        Some(trap) => plain(FaultKind::Trap, printed.unwrap_or_else(|| trap.to_string())),
+        Some(trap) => {
+            plain(FaultKind::Trap, printed.map_or_else(|| trap.to_string(), with_way_out))
+        }
         None => plain(FaultKind::HostCall, format!("{}", error.root_cause())),
+    }
+}
+
+/// Appends the way out to a panic about a file or a thread.
+fn with_way_out(panic: String) -> String {
+    let hints = [
+        ("failed to spawn thread", "a lambda has no threads"),
+        ("Os { code: 44,", "a lambda has no files; keep bytes in its scratch"),
+    ];
+    match hints.iter().find(|(part, _)| panic.contains(part)) {
+        Some((_, hint)) => format!("{panic}; {hint}"),
+        None => panic,
     }
 }

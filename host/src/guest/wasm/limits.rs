@@ -23,8 +23,8 @@ pub(super) struct Caps {
 /// A request beyond a cap.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct RefusedGrowth {
-    /// `bytes of memory` or `elements of tables`.
-    pub(super) what: &'static str,
+    /// Key in `[limits]`: `memory`, in bytes, or `tables`, in elements.
+    pub(super) limit: &'static str,
     pub(super) requested: u64,
     pub(super) allowed: u64,
 }
@@ -73,7 +73,7 @@ impl ResourceLimiter for Caps {
         }
         if !fits {
             let (requested, allowed) = (total as u64, self.memory_allowed as u64);
-            self.refused = Some(RefusedGrowth { what: "bytes of memory", requested, allowed });
+            self.refused = Some(RefusedGrowth { limit: "memory", requested, allowed });
             return Ok(false);
         }
         if grows {
@@ -91,7 +91,7 @@ impl ResourceLimiter for Caps {
         let total = self.table_elements.saturating_add(desired.saturating_sub(now));
         if total > self.tables_allowed {
             let (requested, allowed) = (total as u64, self.tables_allowed as u64);
-            self.refused = Some(RefusedGrowth { what: "elements of tables", requested, allowed });
+            self.refused = Some(RefusedGrowth { limit: "tables", requested, allowed });
             return Ok(false);
         }
         let grows = max.is_none_or(|max| desired <= max);
@@ -128,13 +128,13 @@ mod tests {
         let requested = MIB as u64 + 1;
         assert_eq!(
             caps.refused(),
-            Some(RefusedGrowth { what: "bytes of memory", requested, allowed: requested - 1 })
+            Some(RefusedGrowth { limit: "memory", requested, allowed: requested - 1 })
         );
         caps.forget_refusal();
         assert!(!caps.table_growing(0, 101, None).unwrap());
         assert_eq!(
             caps.refused(),
-            Some(RefusedGrowth { what: "elements of tables", requested: 101, allowed: 100 })
+            Some(RefusedGrowth { limit: "tables", requested: 101, allowed: 100 })
         );
     }
 

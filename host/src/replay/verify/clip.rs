@@ -36,8 +36,8 @@ pub(super) fn verify(
     check_inputs(&clip, &header)?;
     let stated = reference.clip.take().expect("a part of a journal is in a clip");
     check_statements(reference.path(), &stated)?;
-    let (rerun, clip, inputs) = Rerun::start(LockstepDrive::new(clip), options, manifest, load)?;
-    let engine = rerun.engine.clone();
+    let drive = LockstepDrive::new(clip);
+    let (rerun, clip, inputs) = Rerun::start(drive, options, manifest, reference, load)?;
     let mut verify_loop = ClipVerifyLoop {
         header: &header,
         start_ns: clip.start_ns(),
@@ -86,7 +86,7 @@ pub(super) fn verify(
     }
     let later = restarts(&stated, &header.lambda);
     let notes = note_interrupted(interrupted).into_iter().chain(note_restarts(later)).collect();
-    Ok(VerifyOutcome { engine, wakes, triggers, uncovered, uncovered_triggers, notes })
+    Ok(VerifyOutcome { wakes, triggers, uncovered, uncovered_triggers, notes })
 }
 
 const CHANGED: &str = "the clip, or its journal, was changed after it was written";

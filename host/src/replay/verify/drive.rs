@@ -36,7 +36,7 @@ pub(super) fn verify(
     let (drive, part) = open_drives(options)?;
     let span = DriveSpan::of(&drive, part);
     let start_ns = drive.start_ns().unwrap_or(0);
-    let (rerun, mut drive, inputs) = Rerun::start(drive, options, manifest, load)?;
+    let (rerun, mut drive, inputs) = Rerun::start(drive, options, manifest, reference, load)?;
     let schedule = WakeSchedule::new(manifest, &inputs);
     let mut verify_loop =
         VerifyLoop { rerun, schedule, reference, start_ns, wakes: 0, triggers: 0 };
@@ -47,7 +47,7 @@ pub(super) fn verify(
             None => verify_loop.end(&inputs),
         }
     });
-    let VerifyLoop { rerun, wakes, triggers, reference, .. } = verify_loop;
+    let VerifyLoop { wakes, triggers, reference, .. } = verify_loop;
     if let Err(failure) = outcome {
         return Err(with_drive(failure, reference, digests));
     }
@@ -63,14 +63,7 @@ pub(super) fn verify(
         None if wakes == 0 => return Err(reference.empty()),
         None => {}
     }
-    Ok(VerifyOutcome {
-        engine: rerun.engine,
-        wakes,
-        triggers,
-        uncovered: 0,
-        uncovered_triggers: 0,
-        notes: Vec::new(),
-    })
+    Ok(VerifyOutcome { wakes, triggers, uncovered: 0, uncovered_triggers: 0, notes: Vec::new() })
 }
 
 struct VerifyLoop<'a> {

@@ -16,7 +16,7 @@ pub(super) use reference::ReferenceJournal;
 use std::sync::Arc;
 use std::time::Instant;
 
-use gleaner_base::Failure;
+use gleaner_base::{Exit, Failure};
 use gleaner_journal::{Difference, JournalEntry};
 use gleaner_lambda::manifest::Manifest;
 use gleaner_protocol::Verified;
@@ -38,18 +38,26 @@ pub(super) fn run(
 ) -> Result<Verified, Failure> {
     let started = Instant::now();
     let outcome = match reference.clip.is_some() {
-        true => clip::verify(options, manifest, reference, load)?,
-        false => drive::verify(options, manifest, reference, load)?,
+        true => clip::verify(options, manifest, reference, load),
+        false => drive::verify(options, manifest, reference, load),
     };
     let (header, truncated) = (reference.header(), reference.reader().truncated());
     let noted = |what: &str, journal: &str, now: &str| {
         (journal != now).then(|| format!("{what}: {journal} in the journal, {now} now"))
     };
+    let engine = reference.engine_now.as_ref();
     let notes = [
-        noted("runs on", &header.engine, &outcome.engine),
+        engine.and_then(|engine| noted("runs on", &header.engine, engine)),
         noted("version of gleaner", &header.gleaner, env!("CARGO_PKG_VERSION")),
         noted("machine", &header.machine, std::env::consts::ARCH),
     ];
+    let outcome = outcome.map_err(|mut failure| {
+        // The likely reason of a difference comes before it.
+        if failure.exit == Exit::Differs {
+            failure.causes.splice(0..0, notes.iter().flatten().cloned());
+        }
+        failure
+    })?;
     Ok(Verified {
         lambda: header.lambda.clone(),
         wakes: outcome.wakes,
@@ -69,7 +77,6 @@ pub(super) fn run(
 
 /// Counts of a comparison without a difference.
 struct VerifyOutcome {
-    engine: String,
     wakes: u64,
     triggers: u64,
     uncovered: u64,
@@ -83,7 +90,6 @@ struct Rerun {
     session: Session,
     entry_builder: EntryBuilder,
     invoker: Invoker,
-    engine: String,
 }
 
 impl Rerun {
@@ -92,19 +98,20 @@ impl Rerun {
         mut drive: T,
         options: &ReplayOptions,
         manifest: &Manifest,
+        reference: &mut ReferenceJournal,
         load: Load<'_>,
     ) -> Result<(Self, T, Vec<Arc<Topic>>), Failure> {
         let SessionSetup { inputs, session, mut guest } =
             SessionSetup::load(&mut drive, &options.lambda, manifest, RunMode::Replay, load)?;
         let lambda = manifest.lambda.name.to_string();
-        let engine = guest.engine();
+        reference.engine_now = Some(guest.engine());
         let initialised = guest.init();
         // The log of `init` belongs to no wake.
         let (init_log, _) = session.take_log();
         initialised.map_err(|fault| not_started(&lambda, fault, &init_log))?;
         let invoker = Invoker::new(session.clone(), guest);
         Ok((
-            Self { lambda, session, entry_builder: EntryBuilder::new(&inputs), invoker, engine },
+            Self { lambda, session, entry_builder: EntryBuilder::new(&inputs), invoker },
             drive,
             inputs,
         ))

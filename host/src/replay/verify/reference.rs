@@ -33,6 +33,8 @@ pub(in crate::replay) struct ReferenceJournal {
     pub(in crate::replay) clip: Option<ClipStatements>,
     /// Notes on limits for which the journal's value is used, not the manifest's.
     pub(super) limits: Vec<String>,
+    /// The engine that runs the lambda again, once it is loaded.
+    pub(super) engine_now: Option<String>,
 }
 
 impl ReferenceJournal {
@@ -102,7 +104,7 @@ impl ReferenceJournal {
 
     fn open(path: &Path, bytes: Box<dyn Read + Send>) -> Result<Self, Failure> {
         let reader = JournalReader::open(bytes).map_err(|error| unusable(path, &error))?;
-        Ok(Self { path: path.to_owned(), reader, clip: None, limits: Vec::new() })
+        Ok(Self { path: path.to_owned(), reader, clip: None, limits: Vec::new(), engine_now: None })
     }
 
     /// The failure of a journal without a complete wake.

@@ -6,7 +6,7 @@ use std::fs;
 
 use gleaner_image::{decode_rgb8, probe};
 use gleaner_rules::pixels::{Encoding, View};
-use gleaner_vision::{DetectorLayout, Placement, Preprocess, prepare};
+use gleaner_vision::{DetectorLayout, Placement, Preparer, Preprocess};
 
 use crate::shared_data::shared_file;
 
@@ -34,7 +34,7 @@ fn difference(how: Preprocess, photo: &Picture, expected: &[u8]) -> f64 {
     let view = View::new(*width, *height, 3 * width, Encoding::Rgb8, false, rgb).unwrap();
     let how = Preprocess { bytes: true, bgr: false, channels_last: true, ..how };
     let mut out = Vec::new();
-    prepare(&view, &how, &mut out).unwrap();
+    Preparer::new().prepare(&view, &how, &mut out).unwrap();
     assert_eq!(out.len(), expected.len());
     let differences = out.iter().zip(expected).map(|(a, b)| u64::from(a.abs_diff(*b)));
     let mean = differences.sum::<u64>() as f64 / out.len() as f64;

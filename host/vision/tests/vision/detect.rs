@@ -1,5 +1,6 @@
 //! Detections in small outputs, against boxes worked out by hand.
 
+use gleaner_vision::DetectorLayout::{Nanodet, NmsFree, Ultralytics, Yolox};
 use gleaner_vision::{
     Detection, DetectorLayout, MAX_CANDIDATES, OutputView, Placed, VisionError, Wanted, detect,
 };
@@ -53,7 +54,7 @@ fn ultralytics(rows: &[[f32; 7]]) -> (Vec<f32>, Vec<f32>) {
 #[track_caller]
 fn run_ultralytics(rows: &[[f32; 7]], wanted: &Wanted) -> Vec<Detection> {
     let (by_number, by_anchor) = ultralytics(rows);
-    let layout = DetectorLayout::Ultralytics;
+    let layout = Ultralytics;
     let found = run(layout, &[1, 7, CELLS as u32], &by_number, wanted).unwrap();
     assert_eq!(run(layout, &[1, CELLS as u32, 7], &by_anchor, wanted).unwrap(), found);
     found
@@ -92,7 +93,7 @@ fn only_wanted_classes_are_read() {
     assert_eq!(classes(&[]), []);
     let (values, _) = ultralytics(&rows);
     let wanted = Wanted { classes: Some(vec![1, 3]), ..all() };
-    let error = run(DetectorLayout::Ultralytics, &[1, 7, 84], &values, &wanted).unwrap_err();
+    let error = run(Ultralytics, &[1, 7, 84], &values, &wanted).unwrap_err();
     assert_eq!(error.to_string(), "class 3 is wanted; the model has classes 0 to 2");
 }
 
@@ -178,12 +179,12 @@ fn a_number_that_is_no_score_is_a_fault_with_its_value() {
         let nms_free = [10.0, 20.0, 30.0, 40.0, value, 0.0];
         let nanodet = [&[value, 0.0], &[0.0; 84 * 34 - 2][..]].concat();
         for (layout, shape, values) in [
-            (DetectorLayout::Ultralytics, [1, 7, 84], &by_number[..]),
-            (DetectorLayout::Ultralytics, [1, 84, 7], &by_anchor),
-            (DetectorLayout::Yolox, [1, 84, 7], &yolox),
-            (DetectorLayout::Yolox, [1, 84, 7], &objectness),
-            (DetectorLayout::NmsFree, [1, 1, 6], &nms_free),
-            (DetectorLayout::Nanodet, [1, 84, 34], &nanodet),
+            (Ultralytics, [1, 7, 84], &by_number[..]),
+            (Ultralytics, [1, 84, 7], &by_anchor),
+            (Yolox, [1, 84, 7], &yolox),
+            (Yolox, [1, 84, 7], &objectness),
+            (NmsFree, [1, 1, 6], &nms_free),
+            (Nanodet, [1, 84, 34], &nanodet),
         ] {
             let message = run(layout, &shape, values, &all()).unwrap_err().to_string();
             let expected = format!("the model returned {value} as a score of layout `");
@@ -199,7 +200,7 @@ fn boxes_that_are_not_in_pixels_are_a_fault() {
     let shape = [1, 2, 6];
     let run = |rows: &[[f32; 6]; 2], min_score| {
         let wanted = Wanted { min_score, ..all() };
-        run(DetectorLayout::NmsFree, &shape, rows.as_flattened(), &wanted)
+        run(NmsFree, &shape, rows.as_flattened(), &wanted)
     };
     let message = run(&rows, 0.25).unwrap_err().to_string();
     assert!(message.starts_with("all boxes that the model returned end below 2 pixels"));
@@ -219,7 +220,7 @@ fn yolox_gives_boxes_relative_to_cells() {
     set(64 + 16 + 1, [0.5, 0.5, 0.0, 0.0, 0.6, 0.4, 0.0]);
     // Not finite after `exp`.
     set(0, [0.5, 0.5, 1000.0, 0.0, 0.9, 0.9, 0.9]);
-    let found = run(DetectorLayout::Yolox, &[1, 84, 7], &values, &all()).unwrap();
+    let found = run(Yolox, &[1, 84, 7], &values, &all()).unwrap();
     assert_eq!(boxes(&found)[0], (0, [32.0, 32.0, 32.0, 32.0]));
     let (class, found_box) = boxes(&found)[1];
     assert_eq!(class, 1);
@@ -239,9 +240,7 @@ fn nms_free_gives_corners_and_keeps_overlaps() {
         [0.0, 16.0, 64.0, 48.0, 0.8, -1.0],
         [0.0, 16.0, 64.0, 48.0, 0.8, f32::NAN],
     ];
-    let run = |wanted: &Wanted| {
-        run(DetectorLayout::NmsFree, &[1, 6, 6], values.as_flattened(), wanted).unwrap()
-    };
+    let run = |wanted: &Wanted| run(NmsFree, &[1, 6, 6], values.as_flattened(), wanted).unwrap();
     assert_eq!(
         boxes(&run(&all())),
         [(2, [20.0, 8.0, 40.0, 40.0]), (0, [0.0, 0.0, 128.0, 64.0]), (2, [20.0, 8.0, 40.0, 40.0])]
@@ -249,12 +248,7 @@ fn nms_free_gives_corners_and_keeps_overlaps() {
     // The model may return any class.
     let wanted = Wanted { classes: Some(vec![0, 70_000]), ..all() };
     assert_eq!(boxes(&run(&wanted)), [(0, [0.0, 0.0, 128.0, 64.0])]);
-    let none = detect(
-        DetectorLayout::NmsFree,
-        &[OutputView { shape: &[1, 0, 6], values: &[] }],
-        &PLACED,
-        &all(),
-    );
+    let none = detect(NmsFree, &[OutputView { shape: &[1, 0, 6], values: &[] }], &PLACED, &all());
     assert_eq!(none, Ok(vec![]));
 }
 
@@ -275,7 +269,7 @@ fn nanodet_gives_distances_to_the_corner_of_a_cell() {
         set(3 * 8 + 4, 1, 0.75, [1, 0, 2, 3]);
         // Column 1, row 1 of the grid with stride 32: the point (32, 32).
         set(83, 0, 0.5, [1, 0, 0, 1]);
-        let found = run(DetectorLayout::Nanodet, &[1, cells as u32, 34], &values, &all()).unwrap();
+        let found = run(Nanodet, &[1, cells as u32, 34], &values, &all()).unwrap();
         // Left 24, upper 24, right 48, lower 48; and left 0, upper 32, right 32, lower 64, of which
         // the frame ends at 48.
         assert_eq!(boxes(&found), [(1, [48.0, 16.0, 48.0, 48.0]), (0, [0.0, 32.0, 64.0, 32.0])]);
@@ -288,33 +282,33 @@ fn outputs_that_do_not_fit_are_refused_with_both_shapes() {
         run(layout, shape, &vec![0.9; count], &all()).unwrap_err().to_string()
     };
     assert_eq!(
-        refusal(DetectorLayout::Yolox, &[1, 100, 85], 8500),
+        refusal(Yolox, &[1, 100, 85], 8500),
         "layout `yolox` needs one output [1, 84, 5 + classes] for an input of 64x64; \
          the model has [1, 100, 85]"
     );
     assert_eq!(
-        refusal(DetectorLayout::Nanodet, &[1, 85, 32], 2720),
+        refusal(Nanodet, &[1, 85, 32], 2720),
         "layout `nanodet` needs one output [1, 85, classes + 32] or [1, 84, classes + 32] \
          for an input of 64x64; the model has [1, 85, 32]"
     );
-    assert!(refusal(DetectorLayout::NmsFree, &[1, 300, 7], 2100).contains("[1, rows, 6]"));
-    assert!(refusal(DetectorLayout::Ultralytics, &[0, 0, 0], 0).contains("[0, 0, 0]"));
-    assert!(refusal(DetectorLayout::Ultralytics, &[1, 300, 90], 27_000).contains("[1, 300, 90]"));
+    assert!(refusal(NmsFree, &[1, 300, 7], 2100).contains("[1, rows, 6]"));
+    assert!(refusal(Ultralytics, &[0, 0, 0], 0).contains("[0, 0, 0]"));
+    assert!(refusal(Ultralytics, &[1, 300, 90], 27_000).contains("[1, 300, 90]"));
     assert_eq!(
-        refusal(DetectorLayout::Ultralytics, &[1, 80, 84], 80 * 84 - 1),
+        refusal(Ultralytics, &[1, 80, 84], 80 * 84 - 1),
         "output [1, 80, 84] of the model has 6719 values"
     );
     for shape in [[1, u32::MAX, 84], [1, 84, 1 << 31], [1, 84, 5]] {
-        assert!(refusal(DetectorLayout::Ultralytics, &shape, 12).ends_with("has 12 values"));
+        assert!(refusal(Ultralytics, &shape, 12).ends_with("has 12 values"));
     }
-    let error = detect(DetectorLayout::Yolox, &[], &PLACED, &all()).unwrap_err().to_string();
+    let error = detect(Yolox, &[], &PLACED, &all()).unwrap_err().to_string();
     assert!(error.ends_with("the model has no output"), "{error}");
 }
 
 #[test]
 fn options_out_of_range_are_refused() {
     let refusal = |wanted: &Wanted, placed: &Placed| {
-        detect(DetectorLayout::Yolox, &[], placed, wanted).unwrap_err().to_string()
+        detect(Yolox, &[], placed, wanted).unwrap_err().to_string()
     };
     assert_eq!(
         refusal(&Wanted { min_score: f32::NAN, ..all() }, &PLACED),
@@ -344,7 +338,7 @@ fn of_many_objects_only_the_best_are_compared() {
     }
     let wanted = Wanted { max_count: u32::MAX, ..all() };
     let shape = [1, count as u32, 6];
-    let found = run(DetectorLayout::NmsFree, &shape, &values, &wanted).unwrap();
+    let found = run(NmsFree, &shape, &values, &wanted).unwrap();
     assert_eq!(found.len(), 1024);
     assert_eq!(found[0].score, values[(count - 1) * 6 + 4]);
     assert!(found.is_sorted_by(|a, b| a.score >= b.score));
@@ -353,6 +347,6 @@ fn of_many_objects_only_the_best_are_compared() {
         row[4] = 0.9;
     }
     values[(count - 1) * 6..].copy_from_slice(&[50.0, 20.0, 60.0, 40.0, 0.3, 1.0]);
-    let found = run(DetectorLayout::NmsFree, &shape, &values, &wanted).unwrap();
+    let found = run(NmsFree, &shape, &values, &wanted).unwrap();
     assert!(found.iter().all(|found| found.class == 0));
 }

@@ -3,7 +3,7 @@
 use std::cell::Cell;
 
 use gleaner_rules::pixels::{Bayer, Encoding, StopCheck, View};
-use gleaner_vision::{Placement, Preparer, Preprocess, VisionError, prepare};
+use gleaner_vision::{Placement, Preparer, Preprocess, VisionError};
 
 const ENCODINGS: [Encoding; 7] = [
     Encoding::Rgb8,
@@ -85,7 +85,7 @@ fn blended(view: &View<'_>, x: u32, y: u32, width: u32, height: u32) -> [f64; 3]
 #[track_caller]
 fn compare(view: &View<'_>, how: &Preprocess, [left, top, width, height]: [u32; 4]) {
     let mut out = Vec::new();
-    prepare(view, how, &mut out).unwrap();
+    Preparer::new().prepare(view, how, &mut out).unwrap();
     assert_eq!(out.len(), how.size().unwrap());
     let values: Vec<f64> = if how.bytes {
         out.iter().map(|byte| f64::from(*byte)).collect()
@@ -201,7 +201,7 @@ fn a_frame_of_the_size_of_the_tensor_is_copied() {
         ..how(16, 12, Placement::Centre)
     };
     let mut out = Vec::new();
-    prepare(&view, &how, &mut out).unwrap();
+    Preparer::new().prepare(&view, &how, &mut out).unwrap();
     assert_eq!(out, data);
 }
 
@@ -222,7 +222,7 @@ fn a_preparer_gives_the_same_result_for_frames_in_any_order() {
         for size in [7, 33] {
             let how = how(size, size, Placement::Centre);
             let placed = preparer.prepare(&view, &how, &mut used).unwrap();
-            assert_eq!(prepare(&view, &how, &mut fresh).unwrap(), placed);
+            assert_eq!(Preparer::new().prepare(&view, &how, &mut fresh).unwrap(), placed);
             assert_eq!(used, fresh);
         }
     }
@@ -235,7 +235,8 @@ fn frames_without_colour_or_with_16_bits_are_refused_with_a_way_out() {
         let step = 4 * encoding.bytes_per_pixel() as u32;
         let view = View::new(4, 4, step, encoding, false, &data).unwrap();
         let mut out = Vec::new();
-        let error = prepare(&view, &how(4, 4, Placement::Stretch), &mut out).unwrap_err();
+        let error =
+            Preparer::new().prepare(&view, &how(4, 4, Placement::Stretch), &mut out).unwrap_err();
         assert!(out.is_empty());
         error.to_string()
     };
@@ -254,7 +255,9 @@ fn frames_without_colour_or_with_16_bits_are_refused_with_a_way_out() {
 #[test]
 fn numbers_that_make_no_tensor_are_refused() {
     let view = View::new(1, 1, 1, Encoding::Mono8, false, &[9]).unwrap();
-    let refusal = |how: Preprocess| prepare(&view, &how, &mut Vec::new()).unwrap_err().to_string();
+    let refusal = |how: Preprocess| {
+        Preparer::new().prepare(&view, &how, &mut Vec::new()).unwrap_err().to_string()
+    };
     let good = how(4, 4, Placement::Stretch);
     for (width, height) in [(0, 4), (4, 0), (8193, 4), (4, u32::MAX)] {
         assert_eq!(
@@ -271,7 +274,11 @@ fn numbers_that_make_no_tensor_are_refused() {
     ] {
         assert_eq!(refusal(how), format!("{start}{end}"));
         // Bytes do not use the numbers.
-        assert!(prepare(&view, &Preprocess { bytes: true, ..how }, &mut Vec::new()).is_ok());
+        assert!(
+            Preparer::new()
+                .prepare(&view, &Preprocess { bytes: true, ..how }, &mut Vec::new())
+                .is_ok()
+        );
     }
     let mut out = [0; 191];
     let error = Preparer::new().prepare_into(&view, &good, None, &mut out).unwrap_err();

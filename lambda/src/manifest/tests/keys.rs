@@ -88,6 +88,26 @@ fn only_a_component_can_be_deterministic() {
 }
 
 #[test]
+fn data_files_are_those_of_a_python_lambda_that_gleaner_does_not_write() {
+    let with =
+        |path: &str| TICKER.replace("[schedule]", &format!("files = [\"{path}\"]\n[schedule]"));
+    let manifest = Manifest::parse(&with("calib/a.json"), "lambda.toml").unwrap();
+    assert_eq!(manifest.to_json()["lambda"]["files"].to_string(), r#"["calib/a.json"]"#);
+    for (path, why, help) in [
+        ("build/a", "names `build/a`, which Gleaner itself writes", "give the data another name"),
+        ("a/.b", "names `a/.b`, which is hidden", "give it a name that does not begin with a dot"),
+        ("a/*", "names `a/*`, which is a pattern", "name each file, or their folder"),
+    ] {
+        refused(&with(path), &format!("lambda.toml, line 6: `lambda.files` {why}"), help);
+    }
+    refused(
+        &with("a").replace("\"python\"", "\"wasm\""),
+        "lambda.toml, line 6: `lambda.files` has no meaning with kind = \"wasm\"",
+        "remove it: put them into `src/`, and use `include_bytes!`",
+    );
+}
+
+#[test]
 fn values_of_another_type_are_refused() {
     let text = "give a text in quotes";
     refused_with(

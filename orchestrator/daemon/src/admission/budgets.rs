@@ -14,7 +14,6 @@ use super::measured::CurrentUse;
 /// Difference of sums of fractions that is none.
 const ROUNDING: f64 = 1e-9;
 
-/// A resource that lambdas share.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Resource {
     Memory,
@@ -24,7 +23,6 @@ enum Resource {
 }
 
 impl Resource {
-    /// Returns its name in the status.
     fn name(self) -> &'static str {
         match self {
             Self::Memory => "memory",
@@ -128,7 +126,6 @@ struct ResourceBudget {
     source: String,
 }
 
-/// The budgets of all resources.
 #[derive(Debug)]
 pub(crate) struct Budgets([ResourceBudget; 4]);
 

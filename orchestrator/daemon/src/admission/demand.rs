@@ -165,7 +165,6 @@ impl DemandModel<'_> {
         LambdaDemand { memory: memory(manifest), cpu, model_time, topics: topics.collect() }
     }
 
-    /// Returns the CPU time of its process.
     fn cpu(&self, manifest: &Manifest, used: Option<&MeasuredUse>, rate: &WakeRate) -> Asked {
         let per_wake = match (manifest.demand.cpu, manifest.demand.fuel) {
             (Some(cpu), _) => Some((cpu.as_secs_f64(), format_duration(cpu))),
@@ -214,7 +213,6 @@ impl DemandModel<'_> {
     }
 }
 
-/// Wakes per second.
 struct WakeRate {
     hz: f64,
     source: DemandSource,

@@ -49,7 +49,6 @@ pub(crate) struct CurrentUse {
     pub(crate) model_time: Option<f64>,
 }
 
-/// Content of the file.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 struct MeasuredFile {
     /// The machine, and its speed in fuel units per second.
@@ -60,7 +59,6 @@ struct MeasuredFile {
     models: BTreeMap<Sha256, f64>,
 }
 
-/// All measurements.
 #[derive(Debug)]
 pub(crate) struct Measurements {
     file: DurableFile,
@@ -75,11 +73,9 @@ pub(crate) struct Measurements {
 struct Window {
     first: Sample,
     newest: Sample,
-    /// Use in the window before.
     last: Option<MeasuredUse>,
 }
 
-/// Counts of a lambda.
 #[derive(Debug, Clone, PartialEq)]
 struct Sample {
     /// Revision, attempt and restarts: the counts go on while these are equal.

@@ -29,7 +29,6 @@ pub(super) async fn soon<T>(event: impl Future<Output = T>) -> T {
     timeout(DEADLINE, event).await.expect("it comes within the deadline")
 }
 
-/// A cloud.
 pub(super) struct FakeCloud {
     /// The client for it.
     pub(super) http: CloudHttp,

@@ -42,7 +42,6 @@ pub(super) struct CloudHttp {
     kept: Option<Arc<Mutex<Option<Requests>>>>,
 }
 
-/// A connection for requests.
 type Requests = SendRequest<Full<Bytes>>;
 
 impl CloudHttp {

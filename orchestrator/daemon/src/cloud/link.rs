@@ -26,7 +26,6 @@ const RENEWAL_INTERVAL: Duration = Duration::from_secs(3600);
 /// Longest life of a connection, in s: the time to the renewal is measured again with the next one.
 const RENEWAL_MAX_S: u64 = 30 * 86_400;
 
-/// The link.
 pub(crate) struct CloudLink {
     pub(crate) api: Api,
 }

@@ -60,7 +60,6 @@ struct LinkView {
     unsent: u64,
 }
 
-/// State of the connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum LinkState {
     Connecting,
@@ -136,7 +135,6 @@ impl Cloud {
         Ok(())
     }
 
-    /// Notes the end of a connection.
     fn has_ended(&self) {
         if self.lock().state == LinkState::Connected {
             self.set_state(LinkState::Connecting, None);

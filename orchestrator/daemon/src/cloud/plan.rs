@@ -7,7 +7,6 @@ use gleaner_lambda::manifest::ItemName;
 
 use crate::state::{CloudWish, Deployed};
 
-/// A step.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Step {
     /// Remove what the cloud deployed, and does not want any more.

@@ -28,7 +28,6 @@ const EVENTS: RateLimit = RateLimit::of(0.1, 100.0);
 /// Number of times that missing files are fetched: another deployment may remove some in between.
 const ROUNDS: u32 = 5;
 
-/// The cloud, in events.
 const CLOUD: &str = "the cloud";
 
 /// A wanted state, and the cloud that has its files.
@@ -41,7 +40,6 @@ pub(super) struct Order {
 /// The outcome of a wanted state.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(super) struct Handled {
-    /// Its number.
     pub(super) generation: u64,
     /// The reasons why parts of it are not applied.
     pub(super) problems: Vec<String>,

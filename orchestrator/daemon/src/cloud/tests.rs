@@ -75,7 +75,6 @@ impl LinkedVehicle {
         Self { api, http, orders, handled: results, settings, answers, channels, _folder }
     }
 
-    /// Opens a connection.
     async fn open(&mut self) -> (RunningSession, ControlChannel) {
         let (api, http) = (self.api.clone(), self.http.clone());
         let (orders, handled) = (self.orders.clone(), self.handled.clone());

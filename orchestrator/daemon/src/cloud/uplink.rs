@@ -45,7 +45,6 @@ pub(super) enum UplinkOrder {
     Tail(TailLease),
 }
 
-/// A stream that is sent.
 struct SentStream {
     life: u64,
     reader: SpoolReader,
@@ -60,7 +59,6 @@ struct SentStream {
     is_unreadable: bool,
 }
 
-/// A batch of records.
 struct Batch {
     lines: Vec<u8>,
     count: u64,

@@ -39,7 +39,6 @@ struct LossyState {
     operations: usize,
 }
 
-/// The disk.
 pub(super) struct LossyDisk {
     disk: RefCell<LossyState>,
     /// Number of the operation, from 0.

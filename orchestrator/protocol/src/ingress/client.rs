@@ -88,6 +88,15 @@ impl IngressRequests {
         self.send(tag::DEFINITIONS, id, &[])
     }
 
+    /// Requests the layout that the writers of topic `id` announce.
+    ///
+    /// # Errors
+    ///
+    /// As [`need_definitions`](Self::need_definitions).
+    pub fn need_layout(&self, id: u32) -> Result<(), LinkError> {
+        self.send(tag::LAYOUT, id, &[])
+    }
+
     /// Publishes a message, little-endian CDR without encapsulation, in the topic that is number
     /// `index` among those that this reader may publish.
     ///

@@ -129,7 +129,6 @@ impl TopicGrant {
     }
 }
 
-/// The fields of one grant.
 struct GrantFields {
     /// Its subject, for errors.
     what: String,

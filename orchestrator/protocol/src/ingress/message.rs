@@ -27,6 +27,13 @@ pub enum ReaderMessage {
         /// ros2msg text of its type and of all types it refers to.
         text: Option<String>,
     },
+    /// The answer to a request for a layout.
+    Layout {
+        /// Id of the topic.
+        id: u32,
+        /// Hash (RIHS01) of the layout that is received; `None` if no writer has announced one.
+        type_hash: Option<String>,
+    },
     /// The state of the source, once a second.
     Status(Box<SourceStatus>),
 }
@@ -54,7 +61,8 @@ pub struct AttachedTopic {
     pub refused: u64,
     /// ros2msg text of the type and all types it refers to, if the source carries it.
     pub definitions: Option<String>,
-    /// Hash (RIHS01) of the layout that is received, if the topic's writers announce one.
+    /// Hash (RIHS01) of the layout that is received, if a writer of the topic has announced one.
+    /// Samples have the layout number 1 if their writer announces it, and 0 if it announces none.
     #[serde(default)]
     pub type_hash: Option<String>,
     /// True if the samples are those of a recording: its definitions are preferred to any other.

@@ -37,6 +37,11 @@ pub enum ReaderRequest {
         /// The id of the topic.
         id: u32,
     },
+    /// It does not know the layout that the writers of a topic announce.
+    NeedLayout {
+        /// The id of the topic.
+        id: u32,
+    },
     /// Publish a message.
     Publish {
         /// Index of the topic among those that the reader may publish.
@@ -166,13 +171,13 @@ impl ReaderLink {
         let malformed =
             |reason| LinkError::Malformed { peer: READER, frame: frame::name(tag), reason };
         match tag {
-            tag::DEFINITIONS if len != 4 => {
+            tag::DEFINITIONS | tag::LAYOUT if len != 4 => {
                 return Err(malformed(format!("it has {len} bytes instead of 4")));
             }
             tag::PUBLISH if !(4..=REQUEST_MAX).contains(&len) => {
                 return Err(malformed(format!("it has {len} bytes instead of 4 to {REQUEST_MAX}")));
             }
-            tag::DEFINITIONS | tag::PUBLISH => {}
+            tag::DEFINITIONS | tag::LAYOUT | tag::PUBLISH => {}
             tag => return Err(LinkError::Unknown { peer: READER, tag }),
         }
         let Some((number, cdr)) = rest.get(..len).and_then(<[u8]>::split_first_chunk) else {
@@ -181,6 +186,7 @@ impl ReaderLink {
         let number = u32::from_le_bytes(*number);
         let request = match tag {
             tag::DEFINITIONS => ReaderRequest::NeedDefinitions { id: number },
+            tag::LAYOUT => ReaderRequest::NeedLayout { id: number },
             _ => ReaderRequest::Publish { index: number, cdr: cdr.to_vec() },
         };
         self.parsed += HEAD + len;

@@ -39,7 +39,6 @@ fn reader(name: &str, topics: u32) -> AddReader {
     AddReader { name: name.to_owned(), topics, publishes: vec![publish] }
 }
 
-/// Sends bytes and descriptors in one message.
 fn send_with(to: &UnixStream, bytes: &[u8], descriptors: &[BorrowedFd<'_>]) {
     let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(8))];
     let mut ancillary = SendAncillaryBuffer::new(&mut space);
@@ -218,7 +217,6 @@ fn invalid_frames_of_a_starter_are_refused_by_name() {
     assert!(matches!(control.add_topics(&many), Err(LinkError::Grant { .. })));
 }
 
-/// Returns both ends of a reader's connection.
 fn connected() -> (ReaderLink, IngressLink, IngressRequests) {
     let (ingress_end, reader_end) = UnixStream::pair().unwrap();
     let (link, requests) = IngressLink::new(reader_end.into());
@@ -320,6 +318,7 @@ fn requests_of_a_reader_arrive_and_never_bring_a_descriptor() {
     assert!(matches!(link.poll(), Ok(Incoming::Nothing)));
     let largest = vec![5; PUBLISH_MAX];
     requests.need_definitions(9).unwrap();
+    requests.need_layout(8).unwrap();
     requests.publish(1, b"cdr").unwrap();
     assert!(matches!(
         requests.publish(1, &[&largest[..], &[0]].concat()),
@@ -327,7 +326,7 @@ fn requests_of_a_reader_arrive_and_never_bring_a_descriptor() {
     ));
     requests.publish(2, &largest).unwrap();
     let mut received = Vec::new();
-    while received.len() < 3 {
+    while received.len() < 4 {
         requests.flush().unwrap();
         if let Incoming::Message(request) = link.poll().unwrap() {
             received.push(request);
@@ -337,6 +336,7 @@ fn requests_of_a_reader_arrive_and_never_bring_a_descriptor() {
         received,
         [
             ReaderRequest::NeedDefinitions { id: 9 },
+            ReaderRequest::NeedLayout { id: 8 },
             ReaderRequest::Publish { index: 1, cdr: b"cdr".to_vec() },
             ReaderRequest::Publish { index: 2, cdr: largest },
         ]

@@ -59,13 +59,11 @@ pub struct RecorderLink {
     /// Frames sent together. They are copied, as sending slices needs `sendmsg`, which can also
     /// send files and is forbidden to a lambda's process.
     batch: Vec<u8>,
-    /// Received bytes of an incomplete frame.
     received: Vec<u8>,
     /// Number of recorders that have ended.
     ends: u64,
 }
 
-/// State of a link.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum LinkState {
     /// The recorder accepts wakes.
@@ -340,7 +338,6 @@ impl RecorderLink {
         Ok(())
     }
 
-    /// Reads available bytes.
     fn read(&mut self, flags: RecvFlags) -> Result<(), LinkError> {
         let mut buffer = [0; READ];
         match recv(&self.socket, &mut buffer, flags) {
@@ -354,7 +351,6 @@ impl RecorderLink {
         }
     }
 
-    /// Returns the next complete message, if any.
     fn next_message(&mut self) -> Result<Option<RecorderMessage>, LinkError> {
         let Some(bytes) = self.received.first_chunk::<HEAD>() else { return Ok(None) };
         let (tag, len) = frame::head(*bytes, RECORDER)?;
@@ -383,7 +379,6 @@ impl RecorderLink {
     }
 }
 
-/// Encodes the identity of a lambda.
 fn encode_hello(header: &JournalHeader) -> Result<Vec<u8>, LinkError> {
     let failed = |source: io::Error| LinkError::Socket { peer: RECORDER, source };
     let payload = serde_json::to_vec(header).map_err(|error| failed(error.into()))?;

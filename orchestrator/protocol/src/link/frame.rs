@@ -52,6 +52,8 @@ pub(crate) mod tag {
     pub(crate) const DEFINITIONS: u8 = 64;
     /// Reader to ingress: `u32` index of the topic to publish, and a message.
     pub(crate) const PUBLISH: u8 = 65;
+    /// Reader to ingress: `u32` id of the topic whose layout it needs.
+    pub(crate) const LAYOUT: u8 = 66;
 }
 
 /// Returns the name of a tag for messages.
@@ -76,6 +78,7 @@ pub(crate) fn name(tag: u8) -> &'static str {
         tag::READER => "message",
         tag::DEFINITIONS => "definitions",
         tag::PUBLISH => "publish",
+        tag::LAYOUT => "layout",
         _ => "unknown",
     }
 }

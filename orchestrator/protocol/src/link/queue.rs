@@ -126,7 +126,6 @@ impl Queue {
         self.sent = 0;
     }
 
-    /// Returns the number of queued bytes.
     pub(super) fn bytes(&self) -> usize {
         self.bytes
     }

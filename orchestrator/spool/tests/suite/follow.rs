@@ -13,7 +13,6 @@ use gleaner_spool::{
 use crate::model::{KIND, STREAM, TIME, config};
 use crate::simulated::SimulatedDisk;
 
-/// Segment 0 with `count` records.
 fn segment(count: u64) -> Vec<u8> {
     let disk = SimulatedDisk::new(5);
     let mut writer = SpoolWriter::with_storage(disk.clone(), config(BUDGET_MIN)).unwrap();

@@ -50,7 +50,6 @@ const HEALTHY: Duration = Duration::from_secs(60);
 /// Interval of looks at the process.
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
 
-/// Receives events, in any thread.
 type Events = Arc<dyn Fn(InferenceEvent) + Send + Sync>;
 
 /// The process, over all its restarts. Dropping it ends the process.
@@ -405,7 +404,6 @@ impl Supervisor {
     }
 }
 
-/// A process that was started.
 struct Process {
     child: Child,
     /// Open, as its end would mean that this program has ended.

@@ -10,7 +10,6 @@ use super::*;
 use crate::inference::InferenceEvent;
 use crate::spec::tests::recording;
 
-/// Keeps the reasons of restarts.
 #[derive(Default)]
 struct RestartReasons(Vec<String>);
 

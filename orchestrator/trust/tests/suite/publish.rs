@@ -18,7 +18,6 @@ use super::*;
 
 const MANIFEST: &str = "lambda = { name = 'brake-dark', version = '0.1.0', kind = 'python', entry = 'main.py' }\nschedule.period = '1s'\n";
 
-/// A built lambda.
 struct BuiltLambda(TempDir);
 
 impl BuiltLambda {

@@ -8,7 +8,6 @@ use super::*;
 /// The time at which the vehicle's program was built.
 const BUILT: u64 = SIGNED - 100 * DAY;
 
-/// A vehicle with its own state.
 struct TestVehicle {
     root: TrustRoot,
     floors: Floors,

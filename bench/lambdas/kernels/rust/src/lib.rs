@@ -145,7 +145,6 @@ enum Requested {
     Hosted(HostWork),
 }
 
-/// Work with a host.
 enum HostWork {
     /// Makes the smallest host call.
     Call,

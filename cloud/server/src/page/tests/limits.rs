@@ -2,8 +2,7 @@ use super::*;
 
 #[tokio::test]
 async fn an_address_that_cannot_be_used_is_answered_by_a_page() {
-    let folder = TempDir::new().unwrap();
-    let cloud = cloud(&folder).await;
+    let (_folder, cloud) = cloud().await;
     let mut user = Browser::of(&cloud, "ann", Role::Viewer).await;
     for path in ["/clips?after=x", "/vehicles?page=-1", "/vehicles/%ff"] {
         let reply = user.get(path).await;
@@ -18,8 +17,7 @@ async fn an_address_that_cannot_be_used_is_answered_by_a_page() {
 
 #[tokio::test]
 async fn streams_that_last_keep_no_page_from_being_read() {
-    let folder = TempDir::new().unwrap();
-    let cloud = cloud(&folder).await;
+    let (_folder, cloud) = cloud().await;
     cloud.store.invite_vehicle("console", "car-1").await.unwrap();
     let mut user = Browser::of(&cloud, "ann", Role::Viewer).await;
     let streams: Vec<_> = std::iter::from_fn(|| cloud.readers.open("ann").ok()).collect();
@@ -32,8 +30,7 @@ async fn streams_that_last_keep_no_page_from_being_read() {
 
 #[tokio::test]
 async fn a_user_in_a_loop_does_not_fill_the_audit_trail() {
-    let folder = TempDir::new().unwrap();
-    let cloud = cloud(&folder).await;
+    let (_folder, cloud) = cloud().await;
     let mut user = Browser::of(&cloud, "ann", Role::Viewer).await;
     let mut made = 0;
     loop {

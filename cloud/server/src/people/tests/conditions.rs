@@ -21,8 +21,7 @@ pub(super) fn offered(release: u64) -> OfferedDeployment {
 
 #[tokio::test]
 async fn a_change_is_made_only_of_the_state_that_it_expects() {
-    let folder = TempDir::new().unwrap();
-    let cloud = cloud(&folder).await;
+    let (_folder, cloud) = cloud().await;
     let token = token_of(&cloud, "ann", Role::Admin).await;
     cloud.store.deploy("console", &offered(1)).await.unwrap();
     let path = "/v1/deployments/brake";
@@ -70,8 +69,7 @@ async fn a_change_is_made_only_of_the_state_that_it_expects() {
 
 #[tokio::test]
 async fn a_request_with_a_key_has_its_effect_once() {
-    let folder = TempDir::new().unwrap();
-    let cloud = cloud(&folder).await;
+    let (_folder, cloud) = cloud().await;
     let token = token_of(&cloud, "ann", Role::Admin).await;
     let other = token_of(&cloud, "bea", Role::Admin).await;
     let invite = async |token: &str, path: &str, key: &str, body: &'static str| {

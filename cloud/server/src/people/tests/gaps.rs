@@ -38,8 +38,7 @@ async fn piece(body: &mut BodyDataStream) -> Vec<Value> {
 
 #[tokio::test]
 async fn what_is_removed_ahead_of_a_reader_is_counted_by_a_gap() {
-    let folder = TempDir::new().unwrap();
-    let cloud = cloud(&folder).await;
+    let (_folder, cloud) = cloud().await;
     let token = token_of(&cloud, "ann", Role::Viewer).await;
     let epoch = connected(&cloud.store, CAR).await;
     append(&cloud, epoch, 0..600, 1000).await;

@@ -5,8 +5,7 @@ use super::*;
 
 #[tokio::test]
 async fn the_description_has_each_request_and_a_foreign_tool_accepts_it() {
-    let folder = TempDir::new().unwrap();
-    let cloud = cloud(&folder).await;
+    let (folder, cloud) = cloud().await;
     let answer = send(&cloud, (Method::GET, "/v1/openapi.json"), None, &[], "").await;
     assert_eq!(answer.headers[header::CONTENT_TYPE], "application/json");
     let description = answer.json();
@@ -71,8 +70,7 @@ fn python(option: &str, arguments: &[&str]) {
 
 #[tokio::test]
 async fn each_answer_has_the_form_that_the_description_states() {
-    let folder = TempDir::new().unwrap();
-    let cloud = cloud(&folder).await;
+    let (folder, cloud) = cloud().await;
     let token = token_of(&cloud, "ann", Role::Admin).await;
     let store = &cloud.store;
     store.invite_vehicle("ann", "car-7").await.unwrap();

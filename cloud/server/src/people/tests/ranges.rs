@@ -3,8 +3,7 @@ use super::*;
 
 #[tokio::test]
 async fn a_file_goes_on_at_a_position_and_other_ranges_get_all_of_it() {
-    let folder = TempDir::new().unwrap();
-    let cloud = cloud(&folder).await;
+    let (folder, cloud) = cloud().await;
     let token = token_of(&cloud, "ann", Role::Viewer).await;
     cloud.store.invite_vehicle("console", "car-7").await.unwrap();
     announce(&cloud.store).await;

@@ -4,10 +4,11 @@ use std::collections::{BTreeMap, HashMap};
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use gleaner_drives::DriveOptions;
 use rusqlite::Connection;
 use tempfile::TempDir;
 
-use crate::support::{TEXT, TYPE, Written, small_chunks};
+use crate::support::{TEXT, TYPE, Written, add_channel, begin, finish, write_data};
 
 /// The tables of rosbag2 since ROS 2 Iron.
 pub const TABLES: &str = "\
@@ -93,18 +94,12 @@ pub fn database(path: &Path, messages: &[Written]) {
 
 /// Returns an MCAP file with `messages`, each converted by `bytes`.
 pub fn mcap_of(messages: &[Written], bytes: impl Fn(&Written) -> Vec<u8>) -> Vec<u8> {
-    let mut writer = small_chunks().create(std::io::Cursor::new(Vec::new())).unwrap();
-    let schema = writer.add_schema(TYPE, "ros2msg", TEXT.as_bytes()).unwrap();
+    let mut writer = begin();
     for message in messages {
-        let channel_id =
-            writer.add_channel(schema, message.topic, "cdr", &BTreeMap::new()).unwrap();
-        let (log_time, publish_time) = (message.at, message.at);
-        let header =
-            mcap::records::MessageHeader { channel_id, sequence: 0, log_time, publish_time };
-        writer.write_to_known_channel(&header, &bytes(message)).unwrap();
+        let channel = add_channel(&mut writer, message.topic, TEXT);
+        write_data(&mut writer, channel, message.at, &bytes(message));
     }
-    writer.finish().unwrap();
-    writer.into_inner().into_inner()
+    finish(writer)
 }
 
 pub fn packed(bytes: &[u8]) -> Vec<u8> {
@@ -186,9 +181,21 @@ pub fn write_metadata(folder: &Path, text: &str) {
     fs::write(folder.join("metadata.yaml"), text).unwrap();
 }
 
+/// Options that unpack files in `folder`.
+pub fn unpack_in(folder: &Path) -> DriveOptions {
+    DriveOptions { unpack_in: Some(folder.to_owned()), ..DriveOptions::default() }
+}
+
 /// Creates a database in `folder` with `messages`, and returns its path.
 pub fn database_in(folder: &TempDir, messages: &[Written]) -> PathBuf {
     let path = folder.path().join("drive.db3");
     database(&path, messages);
     path
+}
+
+/// Creates a database with `messages` in a folder, which is returned with its path.
+pub fn new_database(messages: &[Written]) -> (TempDir, PathBuf) {
+    let folder = folder();
+    let path = database_in(&folder, messages);
+    (folder, path)
 }

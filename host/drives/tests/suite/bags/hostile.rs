@@ -8,7 +8,7 @@ use gleaner_drives::{Damage, DamageLocation, DriveLimits, Replay, ReplayError};
 use gleaner_transport::Transport;
 use rusqlite::Connection;
 
-use super::bag::{add_message, add_topic, cdr, database_in, empty_database, folder};
+use super::bag::{TABLES, add_message, add_topic, cdr, empty_database, folder, new_database};
 use crate::support::{MemorySink, TYPE, expected, file, listen, run, spec, ticking};
 
 const TOPICS: [&str; 2] = ["/a", "/b"];
@@ -24,6 +24,15 @@ pub fn refused(path: &Path) -> ReplayError {
     Replay::open(&[path.to_owned()]).err().expect("an error")
 }
 
+/// Returns the error of the database that a replay of `path` is refused with.
+#[track_caller]
+fn refusal(path: &Path) -> String {
+    match refused(path) {
+        ReplayError::Database { source, .. } => source.to_string(),
+        other => panic!("{other}"),
+    }
+}
+
 /// Returns the messages that a database of one topic delivers, and the error at its end.
 fn replayed(path: &Path) -> (Vec<(i64, i64)>, Option<ReplayError>) {
     let mut replay = Replay::open(&[path.to_owned()]).unwrap();
@@ -34,8 +43,7 @@ fn replayed(path: &Path) -> (Vec<(i64, i64)>, Option<ReplayError>) {
 
 /// Creates a database with five messages, then changes it by `sql`.
 fn changed(sql: &str) -> (tempfile::TempDir, PathBuf) {
-    let folder = folder();
-    let path = database_in(&folder, &ticking(&["/a"], 5, 10));
+    let (folder, path) = new_database(&ticking(&["/a"], 5, 10));
     Connection::open(&path).unwrap().execute_batch(sql).unwrap();
     (folder, path)
 }
@@ -43,8 +51,7 @@ fn changed(sql: &str) -> (tempfile::TempDir, PathBuf) {
 #[test]
 fn a_database_truncated_anywhere_delivers_its_readable_part_and_an_error() {
     let messages = ticking(&TOPICS, 6000, 1000);
-    let folder = folder();
-    let path = database_in(&folder, &messages);
+    let (_folder, path) = new_database(&messages);
     let bytes = fs::read(&path).unwrap();
     let (mut most, mut opened) = (0, 0);
     for part in 1..40 {
@@ -70,8 +77,7 @@ fn a_database_truncated_anywhere_delivers_its_readable_part_and_an_error() {
 #[test]
 fn flipped_bytes_in_a_database_cause_only_damage_or_other_messages() {
     let messages = ticking(&TOPICS, 800, 1000);
-    let folder = folder();
-    let path = database_in(&folder, &messages);
+    let (_folder, path) = new_database(&messages);
     let bytes = fs::read(&path).unwrap();
     let mut damaged = 0;
     for step in 0..400 {
@@ -117,7 +123,7 @@ fn a_message_without_bytes_is_damage_and_not_skipped() {
     let folder = folder();
     let path = folder.path().join("drive.db3");
     let db = Connection::open(&path).unwrap();
-    let tables = super::bag::TABLES.replace("data BLOB NOT NULL", "data BLOB");
+    let tables = TABLES.replace("data BLOB NOT NULL", "data BLOB");
     db.execute_batch(&tables).unwrap();
     let topic = add_topic(&db, "/a", TYPE);
     db.execute("INSERT INTO messages (topic_id, timestamp, data) VALUES (?1, 5, NULL)", [topic])
@@ -138,10 +144,8 @@ fn invalid_times_are_damage() {
         let folder = folder();
         let path = folder.path().join("drive.db3");
         let db = Connection::open(&path).unwrap();
-        db.execute_batch(
-            &super::bag::TABLES.replace("timestamp INTEGER NOT NULL", "timestamp INTEGER"),
-        )
-        .unwrap();
+        let tables = TABLES.replace("timestamp INTEGER NOT NULL", "timestamp INTEGER");
+        db.execute_batch(&tables).unwrap();
         let topic = add_topic(&db, "/a", TYPE);
         ticking(&["/a"], 5, 10)
             .iter()
@@ -200,8 +204,8 @@ fn views_virtual_tables_and_computed_columns_are_refused() {
         ("ALTER TABLE topics DROP COLUMN type;".to_owned(), "no column `type`"),
     ] {
         let (_folder, path) = changed(&sql);
-        let ReplayError::Database { source, .. } = refused(&path) else { panic!("{sql}") };
-        assert!(source.to_string().contains(expected), "{sql}: {source}");
+        let error = refusal(&path);
+        assert!(error.contains(expected), "{sql}: {error}");
     }
 }
 
@@ -236,8 +240,8 @@ fn an_index_that_sqlite_would_have_to_sort_in_memory_is_refused() {
     ] {
         let (_folder, path) =
             changed(&format!("{table} {columns}); CREATE INDEX at ON messages ({index});"));
-        let ReplayError::Database { source, .. } = refused(&path) else { panic!("{columns}") };
-        assert!(source.to_string().contains(expected), "{columns}: {source}");
+        let error = refusal(&path);
+        assert!(error.contains(expected), "{columns}: {error}");
     }
 }
 
@@ -248,11 +252,9 @@ fn a_schema_of_an_unknown_version_is_refused() {
     for version in [0, 5, 99, -1] {
         let (_folder, path) =
             changed(&format!("{schema} INSERT INTO schema VALUES ({version}, 'x');"));
-        let ReplayError::Database { source, .. } = refused(&path) else { panic!("{version}") };
-        assert_eq!(
-            source.to_string(),
-            format!("its schema has version {version}; only versions 1 to 4 can be read")
-        );
+        let expected =
+            format!("its schema has version {version}; only versions 1 to 4 can be read");
+        assert_eq!(refusal(&path), expected);
     }
     for rows in ["", "INSERT INTO schema VALUES (1, 'x');", "INSERT INTO schema VALUES (4, 'x');"] {
         let (_folder, path) = changed(&format!("{schema} {rows}"));
@@ -268,8 +270,8 @@ fn two_topics_with_the_same_number_are_refused() {
          INSERT INTO topics VALUES (1, '/a', 'test_msgs/msg/Number', 'cdr'), (1, '/b', \
          'test_msgs/msg/Number', 'cdr');",
     );
-    let ReplayError::Database { source, .. } = refused(&path) else { panic!("another error") };
-    assert!(source.to_string().contains("two of its topics have the number 1"), "{source}");
+    let error = refusal(&path);
+    assert!(error.contains("two of its topics have the number 1"), "{error}");
 }
 
 #[test]
@@ -280,8 +282,8 @@ fn too_many_definitions_are_refused_even_if_they_are_short() {
          type_description_hash)
          SELECT '', '', '', '' FROM n;",
     );
-    let ReplayError::Database { source, .. } = refused(&path) else { panic!("another error") };
-    assert!(source.to_string().contains("more than 64 MiB"), "{source}");
+    let error = refusal(&path);
+    assert!(error.contains("more than 64 MiB"), "{error}");
 }
 
 #[test]
@@ -323,15 +325,12 @@ fn the_error_for_a_database_that_was_not_closed_has_the_way_out() {
 
 #[test]
 fn a_journal_that_cannot_be_read_is_an_error() {
-    let folder = folder();
-    let path = database_in(&folder, &ticking(&["/a"], 5, 10));
+    let (folder, path) = new_database(&ticking(&["/a"], 5, 10));
     for suffix in ["-wal", "-journal"] {
         let beside = folder.path().join(format!("drive.db3{suffix}"));
         fs::create_dir(&beside).unwrap();
-        assert!(
-            matches!(refused(&path), ReplayError::Open { path, .. } if path == beside),
-            "{suffix}"
-        );
+        let error = refused(&path);
+        assert!(matches!(error, ReplayError::Open { path, .. } if path == beside), "{suffix}");
         fs::remove_dir(&beside).unwrap();
         // Content of a journal that SQLite has finished.
         fs::write(&beside, [0; 512]).unwrap();
@@ -341,8 +340,7 @@ fn a_journal_that_cannot_be_read_is_an_error() {
 
 #[test]
 fn a_pipe_is_refused_without_blocking() {
-    let folder = folder();
-    let path = database_in(&folder, &ticking(&["/a"], 5, 10));
+    let (folder, path) = new_database(&ticking(&["/a"], 5, 10));
     let pipe = |name: &str| {
         let made =
             std::process::Command::new("mkfifo").arg(folder.path().join(name)).status().unwrap();

@@ -9,9 +9,11 @@ use std::time::{Duration, SystemTime};
 use gleaner_drives::{Damage, DriveLimits, DriveOptions, Replay, ReplayError, Unpacked, unpack};
 use gleaner_transport::{Delivery, SampleMeta, Sink, TopicSpec, Transport};
 
-use super::bag::{Packing, Storage, bag, cdr, folder, mcap_of, packed};
+use super::bag::{Packing, Storage, bag, cdr, folder, mcap_of, packed, unpack_in};
 use super::hostile::{damage, refused};
-use crate::support::{MemorySink, drive, expected, file, listen, run, small_chunks, spec, ticking};
+use crate::support::{
+    MemorySink, drive, expected, file, listen, run, run_whole, small_chunks, spec, ticking,
+};
 
 const TOPICS: [&str; 2] = ["/a", "/b"];
 
@@ -42,19 +44,14 @@ fn a_message_that_unpacks_to_too_much_is_too_big_but_the_next_is_not() {
     let sink = Arc::new(LimitedSink { most: 1000, shown: AtomicUsize::new(0) });
     let small = TopicSpec { max_bytes: 1000, ..spec("/a") };
     replay.subscribe(&small, sink.clone()).unwrap();
-    let (steps, error) = run(&mut replay);
-    assert!(error.is_none(), "{error:?}");
+    let steps = run_whole(&mut replay);
     let deliveries: Vec<_> = steps.iter().map(|step| step.delivery).collect();
     assert_eq!(deliveries, [Delivery::Taken, Delivery::TooBig, Delivery::Taken]);
     assert_eq!(sink.shown.load(Ordering::Relaxed), 8);
     // A sink without a limit gets an error at the limit of the drive.
     let mut replay = open(DriveLimits { chunk_bytes: 1 << 20, ..DriveLimits::default() });
-    replay
-        .subscribe(
-            &TopicSpec { max_bytes: usize::MAX, ..spec("/a") },
-            Arc::new(MemorySink::default()),
-        )
-        .unwrap();
+    let endless = TopicSpec { max_bytes: usize::MAX, ..spec("/a") };
+    replay.subscribe(&endless, Arc::new(MemorySink::default())).unwrap();
     let (steps, error) = run(&mut replay);
     assert_eq!(steps.len(), 1);
     assert!(matches!(damage(error).1, Damage::MessageTooLarge { allowed: 1_048_576, .. }));
@@ -80,8 +77,7 @@ fn a_packed_message_is_delivered_whole_or_is_too_big() {
         for &max_bytes in limits {
             replay.subscribe(&TopicSpec { max_bytes, ..spec("/a") }, memory.clone()).unwrap();
         }
-        let (steps, error) = run(&mut replay);
-        assert!(error.is_none(), "{error:?}");
+        let steps = run_whole(&mut replay);
         let taken: Vec<_> = memory.0.lock().unwrap().iter().map(|(_, cdr)| cdr.len()).collect();
         assert_eq!(taken, lens, "{limits:?}");
         let too_big = steps.iter().filter(|step| step.delivery == Delivery::TooBig).count();
@@ -106,11 +102,7 @@ fn a_file_that_unpacks_to_too_much_is_refused_and_leaves_nothing() {
     let folder = folder();
     let small = drive(small_chunks(), &ticking(&["/a"], 3, 10));
     let limits = DriveLimits { unpacked_bytes: 1 << 20, ..DriveLimits::default() };
-    let options = DriveOptions {
-        limits,
-        unpack_in: Some(folder.path().to_owned()),
-        ..DriveOptions::default()
-    };
+    let options = DriveOptions { limits, ..unpack_in(folder.path()) };
     let open = |paths: &[PathBuf]| Replay::open_as(paths, &options).map(drop);
     let error = open(&[file(&packed(&[&small[..], &noise(2 << 20)].concat()))]).unwrap_err();
     assert!(matches!(error, ReplayError::UnpacksTooLarge { allowed: 1_048_576, .. }), "{error}");
@@ -120,10 +112,8 @@ fn a_file_that_unpacks_to_too_much_is_refused_and_leaves_nothing() {
     let parts = [file(&packed(&part)), file(&packed(&part))];
     open(&parts[..1]).unwrap();
     let error = open(&parts).unwrap_err();
-    assert!(
-        matches!(&error, ReplayError::UnpacksTooLarge { path, .. } if *path == parts[1]),
-        "{error}"
-    );
+    let ReplayError::UnpacksTooLarge { path, .. } = &error else { panic!("{error}") };
+    assert_eq!(*path, parts[1]);
     assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
 }
 
@@ -134,11 +124,7 @@ fn a_bomb_is_refused_by_its_size_long_before_the_disk_is_full() {
         &[&drive(small_chunks(), &ticking(&["/a"], 3, 10))[..], &vec![0; 64 << 20]].concat(),
     );
     let limits = DriveLimits { unpacked_bytes: 64 << 20, ..DriveLimits::default() };
-    let options = DriveOptions {
-        limits,
-        unpack_in: Some(folder.path().to_owned()),
-        ..DriveOptions::default()
-    };
+    let options = DriveOptions { limits, ..unpack_in(folder.path()) };
     let error = Replay::open_as(&[file(&bomb)], &options).err().unwrap();
     let ReplayError::UnpacksManyTimes { allowed, .. } = &error else { panic!("{error}") };
     assert_eq!(*allowed, (200 * bomb.len() as u64).max(1 << 20));
@@ -151,9 +137,7 @@ fn unpacked_content_has_no_name() {
     let messages = ticking(&TOPICS, 60, 1000);
     for storage in [Storage::Mcap, Storage::Sqlite3] {
         let bag = bag(storage, Packing::Files, &[&messages]);
-        let options =
-            DriveOptions { unpack_in: Some(folder.path().to_owned()), ..DriveOptions::default() };
-        let unpacked = unpack(&[bag.path().to_owned()], &options).unwrap();
+        let unpacked = unpack(&[bag.path().to_owned()], &unpack_in(folder.path())).unwrap();
         assert_eq!(unpacked.len(), 1);
         // A kill from here on leaves no file.
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0, "{storage:?}");
@@ -209,9 +193,7 @@ fn only_files_of_killed_processes_are_removed() {
     fs::hard_link(path(".unpacked-twice"), path("second")).unwrap();
     fs::create_dir(path(".unpacked-folder")).unwrap();
     std::os::unix::fs::symlink(path("drive.mcap"), path(".unpacked-link")).unwrap();
-    let options =
-        DriveOptions { unpack_in: Some(folder.path().to_owned()), ..DriveOptions::default() };
-    Replay::open_as(&[packed], &options).unwrap();
+    Replay::open_as(&[packed], &unpack_in(folder.path())).unwrap();
     let mut left: Vec<_> =
         fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect();
     left.sort();
@@ -223,8 +205,8 @@ fn only_files_of_killed_processes_are_removed() {
 fn content_of_an_unknown_format_is_not_unpacked() {
     let folder = folder();
     let nowhere = folder.path().join("not there");
-    let options = DriveOptions { unpack_in: Some(nowhere), ..DriveOptions::default() };
-    let error = Replay::open_as(&[file(&packed(&vec![7; 8 << 20]))], &options).err().unwrap();
+    let path = file(&packed(&vec![7; 8 << 20]));
+    let error = Replay::open_as(&[path], &unpack_in(&nowhere)).err().unwrap();
     assert!(matches!(error, ReplayError::NotMcap { .. }), "{error}");
 }
 

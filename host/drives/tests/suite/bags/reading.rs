@@ -2,15 +2,16 @@
 
 use std::fs;
 
-use gleaner_drives::{DriveOptions, Progress, Replay, files_of};
+use gleaner_drives::{Progress, Replay, files_of};
 use gleaner_transport::Transport;
 
 use super::bag::{
     Packing, Storage, add_message, add_topic, bag, cdr, database, database_in, database_of,
-    empty_database, folder, metadata, packed, write_metadata,
+    empty_database, folder, metadata, new_database, packed, unpack_in, write_metadata,
 };
 use crate::support::{
-    Written, drive, expected, file, listen, replayed, run, small_chunks, ticking,
+    Written, delivered, drive, expected, file, listen, replayed, run, run_whole, small_chunks,
+    ticking,
 };
 
 const TOPICS: [&str; 2] = ["/a", "/b"];
@@ -39,11 +40,8 @@ fn a_database_is_read_by_time_and_then_by_number() {
         at("/a", 6, 4),
         at("/b", 0, 5),
     ];
-    let folder = folder();
-    let path = database_in(&folder, &messages);
-    let (all, error) = replayed(&[path], &TOPICS);
-    assert!(error.is_none(), "{error:?}");
-    assert_eq!(all, [(0, 5), (5, 1), (5, 2), (5, 3), (6, 4), (7, 0)]);
+    let (_folder, path) = new_database(&messages);
+    assert_eq!(delivered(&[path], &TOPICS), [(0, 5), (5, 1), (5, 2), (5, 3), (6, 4), (7, 0)]);
 }
 
 #[test]
@@ -62,8 +60,7 @@ fn a_database_of_many_pieces_keeps_its_order_where_times_are_equal() {
     database_of(&path, &messages, |message| [cdr(message), vec![0; 400]].concat());
     let mut replay = Replay::open(&[path]).unwrap();
     let memory = listen(&mut replay, &TOPICS);
-    let (steps, error) = run(&mut replay);
-    assert!(error.is_none(), "{error:?}");
+    let steps = run_whole(&mut replay);
     assert_eq!(steps.len(), 20_000);
     let taken = memory.0.lock().unwrap();
     let values = taken.iter().map(|(_, cdr)| i64::from_le_bytes(*cdr.first_chunk().unwrap()));
@@ -79,17 +76,14 @@ fn databases_and_mcap_files_are_merged_by_time() {
     let paths = [database_in(&folder, &third(0)), file(&drive(small_chunks(), &third(1)))];
     let packed_path = folder.path().join("packed");
     fs::write(&packed_path, packed(&drive(small_chunks(), &third(2)))).unwrap();
-    let (all, error) = replayed(&[&paths[..], &[packed_path]].concat(), &TOPICS);
-    assert!(error.is_none(), "{error:?}");
-    assert_eq!(all, expected(&messages));
+    assert_eq!(delivered(&[&paths[..], &[packed_path]].concat(), &TOPICS), expected(&messages));
 }
 
 #[test]
 fn a_topic_without_subscription_is_skipped() {
     let messages = ticking(&TOPICS, 60, 1000);
     let folder = folder();
-    let (all, error) = replayed(&[database_in(&folder, &messages)], &["/b"]);
-    assert!(error.is_none(), "{error:?}");
+    let all = delivered(&[database_in(&folder, &messages)], &["/b"]);
     let of_b: Vec<_> = messages.into_iter().filter(|message| message.topic == "/b").collect();
     assert_eq!(all, expected(&of_b));
 }
@@ -103,10 +97,8 @@ fn topics_are_described_as_in_the_metadata() {
     let topics = replay.topics();
     assert_eq!(topics.iter().map(|topic| topic.topic.as_str()).collect::<Vec<_>>(), TOPICS);
     assert!(topics.iter().all(|topic| topic.messages == Some(15)), "{topics:?}");
-    assert!(
-        topics.iter().all(|topic| topic.offered_qos.as_deref() == Some("- depth: 5")),
-        "{topics:?}"
-    );
+    let qos = Some("- depth: 5");
+    assert!(topics.iter().all(|topic| topic.offered_qos.as_deref() == qos), "{topics:?}");
     listen(&mut replay, &TOPICS);
     assert_eq!(replay.progress(), Progress { done: 0, total: Some(30) });
 }
@@ -147,9 +139,7 @@ fn a_database_of_an_old_distribution_is_read() {
     let messages = ticking(&["/a"], 5, 10);
     messages.iter().for_each(|message| add_message(&db, 4, message.at as i64, &cdr(message)));
     drop(db);
-    let (all, error) = replayed(&[path], &["/a"]);
-    assert!(error.is_none(), "{error:?}");
-    assert_eq!(all, expected(&messages));
+    assert_eq!(delivered(&[path], &["/a"]), expected(&messages));
 }
 
 #[test]
@@ -157,8 +147,7 @@ fn an_empty_database_is_an_empty_drive() {
     let folder = folder();
     let path = folder.path().join("drive.db3");
     add_topic(&empty_database(&path), "/a", crate::support::TYPE);
-    let (all, error) = replayed(&[path], &["/a"]);
-    assert!(error.is_none(), "{error:?}");
+    let all = delivered(&[path], &["/a"]);
     assert!(all.is_empty());
 }
 
@@ -174,9 +163,7 @@ fn a_directory_without_metadata_is_read_file_by_file() {
     let names: Vec<_> =
         files_of(&path).unwrap().iter().map(|path| path.file_name().unwrap().to_owned()).collect();
     assert_eq!(names, ["bag_0.mcap", "bag_1.mcap"]);
-    let (all, error) = replayed(&path, &TOPICS);
-    assert!(error.is_none(), "{error:?}");
-    assert_eq!(all, expected(&messages));
+    assert_eq!(delivered(&path, &TOPICS), expected(&messages));
 }
 
 #[test]
@@ -185,9 +172,7 @@ fn a_directory_of_version_3_may_have_been_renamed() {
     let folder = folder();
     database(&folder.path().join("drive_0.db3"), &messages);
     write_metadata(folder.path(), &metadata(3, "sqlite3", "", &["drive/drive_0.db3"], &messages));
-    let (all, error) = replayed(&[folder.path().to_owned()], &TOPICS);
-    assert!(error.is_none(), "{error:?}");
-    assert_eq!(all, expected(&messages));
+    assert_eq!(delivered(&[folder.path().to_owned()], &TOPICS), expected(&messages));
 }
 
 #[test]
@@ -199,11 +184,8 @@ fn files_that_were_packed_or_unpacked_later_are_found() {
         let bytes = if there.ends_with("zstd") { packed(&bytes) } else { bytes };
         fs::write(folder.path().join(there), bytes).unwrap();
         write_metadata(folder.path(), &metadata(8, "mcap", "FILE", &[named], &messages));
-        assert_eq!(
-            replayed(&[folder.path().to_owned()], &TOPICS).0,
-            expected(&messages),
-            "{there}"
-        );
+        let (all, _) = replayed(&[folder.path().to_owned()], &TOPICS);
+        assert_eq!(all, expected(&messages), "{there}");
     }
 }
 
@@ -212,19 +194,15 @@ fn unpacked_content_is_in_the_given_folder_and_is_removed() {
     let messages = ticking(&TOPICS, 60, 1000);
     for storage in [Storage::Mcap, Storage::Sqlite3] {
         let (bag, folder) = (bag(storage, Packing::Files, &[&messages]), folder());
-        let options =
-            DriveOptions { unpack_in: Some(folder.path().to_owned()), ..DriveOptions::default() };
-        let mut replay = Replay::open_as(&[bag.path().to_owned()], &options).unwrap();
+        let paths = [bag.path().to_owned()];
+        let mut replay = Replay::open_as(&paths, &unpack_in(folder.path())).unwrap();
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
         let memory = listen(&mut replay, &TOPICS);
         assert!(run(&mut replay).1.is_none());
         assert_eq!(memory.values(), expected(&messages));
         // A folder that does not exist is an error.
-        let nowhere = DriveOptions {
-            unpack_in: Some(folder.path().join("missing")),
-            ..DriveOptions::default()
-        };
-        let refused = Replay::open_as(&[bag.path().to_owned()], &nowhere).err().unwrap();
+        let nowhere = unpack_in(&folder.path().join("missing"));
+        let refused = Replay::open_as(&paths, &nowhere).err().unwrap();
         assert!(refused.help().unwrap().contains("zstd -d"), "{refused}");
     }
 }
@@ -240,8 +218,7 @@ fn a_path_may_contain_any_character() {
 
 #[test]
 fn reading_leaves_nothing_beside_a_database() {
-    let folder = folder();
-    let path = database_in(&folder, &ticking(&TOPICS, 20, 1000));
+    let (folder, path) = new_database(&ticking(&TOPICS, 20, 1000));
     let before = fs::read(&path).unwrap();
     replayed(std::slice::from_ref(&path), &TOPICS);
     assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);

@@ -2,10 +2,11 @@
 
 use super::*;
 use crate::backend::ExecutionProvider;
+use crate::backend::elements::bytes;
 use crate::inspect::{ModelSignature, inspect};
 use crate::onnx::{
     BOOL, FLOAT32, INT8, INT32, INT64, Proto, UINT8, constant, graph, model_with_opset, node,
-    number_attribute, numbers_attribute, value, value_of,
+    number_attribute, number_of, numbers_attribute, value, value_of,
 };
 
 const ZERO_POINTS: [(&str, i32); 2] = [("za", 10), ("zb", 128)];
@@ -21,18 +22,16 @@ struct Wrong {
     right: TensorValue,
 }
 
-fn bytes_of<T: Copy, const N: usize>(values: &[T], bytes: impl Fn(T) -> [u8; N]) -> Vec<u8> {
-    values.iter().flat_map(|value| bytes(*value)).collect()
+fn floats_of(shape: &[u32], values: &[f32]) -> TensorValue {
+    TensorValue { element: Element::Float32, shape: shape.to_vec(), bytes: bytes(values) }
 }
 
-fn floats_of(shape: &[u32], values: &[f32]) -> TensorValue {
-    let bytes = bytes_of(values, f32::to_le_bytes);
-    TensorValue { element: Element::Float32, shape: shape.to_vec(), bytes }
+fn float(value: f32) -> TensorValue {
+    floats_of(&[1], &[value])
 }
 
 fn wide(shape: &[u32], values: &[i64]) -> TensorValue {
-    let bytes = bytes_of(values, i64::to_le_bytes);
-    TensorValue { element: Element::Int64, shape: shape.to_vec(), bytes }
+    TensorValue { element: Element::Int64, shape: shape.to_vec(), bytes: bytes(values) }
 }
 
 fn text_attribute(name: &str, text: &str) -> Proto {
@@ -40,21 +39,11 @@ fn text_attribute(name: &str, text: &str) -> Proto {
 }
 
 fn floats_constant(name: &str, shape: &[i64], values: &[f32]) -> Proto {
-    constant(name, FLOAT32, shape, &bytes_of(values, f32::to_le_bytes))
+    constant(name, FLOAT32, shape, &bytes(values))
 }
 
 fn wide_constant(name: &str, shape: &[i64], values: &[i64]) -> Proto {
-    constant(name, INT64, shape, &bytes_of(values, i64::to_le_bytes))
-}
-
-fn number_of(element: Element) -> i64 {
-    match element {
-        Element::Int64 => INT64,
-        Element::Int32 => INT32,
-        Element::Uint8 => UINT8,
-        Element::Boolean => BOOL,
-        _ => FLOAT32,
-    }
+    constant(name, INT64, shape, &bytes(values))
 }
 
 impl Wrong {
@@ -96,6 +85,14 @@ fn load_as(model: &[u8], signature: ModelSignature) -> Result<Box<dyn LoadedGrap
     let provider = ExecutionProvider::Cpu;
     let options = LoadOptions { provider, threads: 1, signature: &signature, engine: None };
     RtenBackend.load(model.to_vec(), &options)
+}
+
+fn load(model: &[u8]) -> Result<Box<dyn LoadedGraph>, BackendError> {
+    load_as(model, inspect(model).unwrap())
+}
+
+fn refusal(model: &[u8]) -> String {
+    load(model).err().unwrap().to_string()
 }
 
 /// Loads a model without the rules.
@@ -165,12 +162,10 @@ fn wrong_models() -> Vec<Wrong> {
             .and("z", constant("z", UINT8, &[], &[10])),
         Wrong::new("MatMul", floats_of(&[2, 1, 1], &[1.0, 2.0]), floats_of(&[2, 1], &[3.0, 6.0]))
             .and("w", floats_constant("w", &[1], &[3.0])),
-        Wrong::new("Sign", floats_of(&[1], &[0.0]), floats_of(&[1], &[0.0])),
-        Wrong::new("Softplus", floats_of(&[1], &[90.0]), floats_of(&[1], &[90.0])),
-        Wrong::new("Cast", floats_of(&[1], &[0.5]), yes.clone())
-            .with(&[number_attribute("to", BOOL)]),
-        Wrong::new("CastLike", floats_of(&[1], &[0.5]), yes)
-            .and("like", constant("like", BOOL, &[1], &[0])),
+        Wrong::new("Sign", float(0.0), float(0.0)),
+        Wrong::new("Softplus", float(90.0), float(90.0)),
+        Wrong::new("Cast", float(0.5), yes.clone()).with(&[number_attribute("to", BOOL)]),
+        Wrong::new("CastLike", float(0.5), yes).and("like", constant("like", BOOL, &[1], &[0])),
         Wrong::new("Add", wide(&[1], &[0]), wide(&[1], &[3_000_000_000]))
             .and("w", wide_constant("w", &[1], &[3_000_000_000])),
     ]
@@ -179,8 +174,7 @@ fn wrong_models() -> Vec<Wrong> {
 #[test]
 fn models_that_rten_computes_wrongly_are_refused_by_operator() {
     for wrong in wrong_models() {
-        let (model, operator, opset) = (wrong.model(), wrong.operator, wrong.opset);
-        let message = load_as(&model, inspect(&model).unwrap()).err().unwrap().to_string();
+        let (message, operator, opset) = (refusal(&wrong.model()), wrong.operator, wrong.opset);
         let begin =
             format!("it has operator `{operator}` of opset {opset}, for which rten computes");
         assert!(message.starts_with(&begin), "{message}");
@@ -219,8 +213,7 @@ fn the_same_operators_are_accepted_where_rten_is_right() {
         Wrong::new("Add", numbers(), numbers())
             .and("w", wide_constant("w", &[1], &[i64::from(i32::MIN)])),
     ] {
-        let model = right.model();
-        let loaded = load_as(&model, inspect(&model).unwrap());
+        let loaded = load(&right.model());
         assert!(loaded.is_ok(), "{} {}", right.operator, loaded.err().unwrap());
     }
 }
@@ -228,7 +221,7 @@ fn the_same_operators_are_accepted_where_rten_is_right() {
 #[test]
 fn a_nan_that_rten_would_hide_is_refused() {
     for operator in ["Relu", "Clip"] {
-        let nan = || floats_of(&[1], &[f32::NAN]);
+        let nan = || float(f32::NAN);
         let wrong = || Wrong::new(operator, nan(), nan());
         let bounded = if operator == "Clip" {
             wrong().and("low", floats_constant("low", &[], &[0.0]))
@@ -237,19 +230,18 @@ fn a_nan_that_rten_would_hide_is_refused() {
         };
         let model = bounded.model();
         let run = |mut graph: Box<dyn LoadedGraph>, value: f32| {
-            graph.run(&[floats_of(&[1], &[value])], &StopSignal::default())
+            graph.run(&[float(value)], &StopSignal::default())
         };
         let hidden = run(load_unchecked(&model), f32::NAN).unwrap();
-        assert_eq!(hidden, [floats_of(&[1], &[0.0])], "{operator}");
-        let checked = || load_as(&model, inspect(&model).unwrap()).unwrap();
-        assert_eq!(run(checked(), 2.0).unwrap(), [floats_of(&[1], &[2.0])]);
+        assert_eq!(hidden, [float(0.0)], "{operator}");
+        let checked = || load(&model).unwrap();
+        assert_eq!(run(checked(), 2.0).unwrap(), [float(2.0)]);
         let message = run(checked(), f32::NAN).unwrap_err().to_string();
         assert!(message.starts_with("an input has a NaN: it has operator"), "{message}");
     }
-    let with_weight = Wrong::new("Relu", floats_of(&[1], &[0.0]), floats_of(&[1], &[0.0]))
+    let with_weight = Wrong::new("Relu", float(0.0), float(0.0))
         .and("w", floats_constant("w", &[1], &[f32::NAN]));
-    let model = with_weight.model();
-    let message = load_as(&model, inspect(&model).unwrap()).err().unwrap().to_string();
+    let message = refusal(&with_weight.model());
     assert!(message.contains("for which rten computes 0 or a bound for NaN"), "{message}");
 }
 
@@ -269,9 +261,7 @@ fn product([rows, inner, columns]: [i64; 3]) -> Vec<u8> {
 fn products_of_8_bit_integers_are_exact_or_refused() {
     // Multiples of the tiles of rten, and numbers that are none.
     for shape in [[8, 64, 32], [7, 67, 33], [1, 18, 5], [1, 3, 1]] {
-        let bytes = product(shape);
-        let loaded = load_as(&bytes, inspect(&bytes).unwrap());
-        let mut graph = match loaded {
+        let mut graph = match load(&product(shape)) {
             Ok(graph) => graph,
             Err(error) => {
                 assert!(products_saturate(), "{error}");

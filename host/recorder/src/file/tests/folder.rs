@@ -8,22 +8,13 @@ use super::super::durable::steps;
 use super::*;
 use crate::error::RecordError;
 
-fn record(folder: &mut RecordingFolder, base: &str) -> Clip {
-    let mut clip = folder.begin(base, &clip_header()).unwrap();
-    add(&mut clip, 0, 6);
-    clip.finish(trailer()).unwrap()
-}
-
 #[test]
 fn a_name_is_given_once() {
-    let scratch = TestDir::new();
-    let (mut folder, _) = scratch.open();
+    let (scratch, mut folder) = opened();
     let files = [record(&mut folder, "a"), record(&mut folder, "a"), record(&mut folder, "../a")]
         .map(|clip| clip.file);
-    assert_eq!(
-        files.map(|file| file.to_str().unwrap().to_owned()),
-        ["clips/a.mcap", "clips/a-2.mcap", "clips/-a.mcap"]
-    );
+    let expected = ["clips/a.mcap", "clips/a-2.mcap", "clips/-a.mcap"];
+    assert_eq!(files.map(|file| file.to_str().unwrap().to_owned()), expected);
     // Not even after the clip was fetched and deleted.
     fs::remove_file(scratch.path("clips/a.mcap")).unwrap();
     fs::remove_file(scratch.path("clips/a.jpg")).unwrap();
@@ -32,8 +23,7 @@ fn a_name_is_given_once() {
 
 #[test]
 fn a_folder_is_held_by_one_recorder_until_its_last_clip_is_closed() {
-    let scratch = TestDir::new();
-    let (mut folder, _) = scratch.open();
+    let (scratch, mut folder) = opened();
     let clip = folder.begin("a", &clip_header()).unwrap();
     drop(folder);
     let error = RecordingFolder::open(&scratch.0).err().expect("the folder is locked");
@@ -44,8 +34,7 @@ fn a_folder_is_held_by_one_recorder_until_its_last_clip_is_closed() {
 
 #[test]
 fn a_torn_last_line_is_truncated_and_its_clip_listed_again() {
-    let scratch = TestDir::new();
-    let (mut folder, _) = scratch.open();
+    let (scratch, mut folder) = opened();
     let clips = [record(&mut folder, "a"), record(&mut folder, "b")];
     drop(folder);
     let list = fs::read(scratch.path("clips.jsonl")).unwrap();
@@ -66,8 +55,7 @@ fn a_torn_last_line_is_truncated_and_its_clip_listed_again() {
 
 #[test]
 fn a_clip_that_is_damaged_or_of_another_program_is_not_listed() {
-    let scratch = TestDir::new();
-    let (mut folder, _) = scratch.open();
+    let (scratch, mut folder) = opened();
     record(&mut folder, "a");
     drop(folder);
     let clip = fs::read(scratch.path("clips/a.mcap")).unwrap();
@@ -82,8 +70,7 @@ fn a_clip_that_is_damaged_or_of_another_program_is_not_listed() {
 
 #[test]
 fn files_of_other_programs_are_left_unchanged() {
-    let scratch = TestDir::new();
-    let (mut folder, _) = scratch.open();
+    let (scratch, mut folder) = opened();
     record(&mut folder, "a");
     drop(folder);
     let foreign = [
@@ -111,8 +98,7 @@ fn files_of_other_programs_are_left_unchanged() {
 
 #[test]
 fn replacing_keeps_the_given_clips() {
-    let scratch = TestDir::new();
-    let (mut folder, _) = scratch.open();
+    let (scratch, mut folder) = opened();
     let [_, keep, _] = ["a", "b", "c"].map(|base| record(&mut folder, base));
     assert_eq!(folder.replace(std::slice::from_ref(&keep)).unwrap(), 2);
     assert_eq!(scratch.listed(), std::slice::from_ref(&keep));
@@ -128,38 +114,30 @@ fn replacing_keeps_the_given_clips() {
 fn a_replacement_that_dies_at_any_step_is_completed_or_not_begun() {
     let mut died = 0;
     for last in 0.. {
-        let scratch = TestDir::new();
-        let (mut folder, _) = scratch.open();
+        let (scratch, mut folder) = opened();
         let [a, keep, c] = ["a", "b", "c"].map(|base| record(&mut folder, base));
         steps::restart(last);
         let replaced = folder.replace(std::slice::from_ref(&keep));
         steps::restart(usize::MAX);
         drop(folder);
         let (mut folder, found) = scratch.open();
-        assert!(
-            found.is_empty(),
-            "died after {last} steps, and {} clips are found that no list named",
-            found.len()
-        );
+        assert_eq!(found, [], "died after {last} steps; no list named these clips");
         let listed = scratch.listed();
         match listed.len() {
-            1 => assert_eq!(
-                (&listed[0], scratch.files()),
-                (&keep, vec!["b.jpg".to_owned(), "b.mcap".to_owned()])
-            ),
-            _ => assert_eq!(
-                (listed, scratch.files().len()),
-                (vec![a, keep, c], 6),
-                "died after {last} steps"
-            ),
+            1 => {
+                assert_eq!(listed[0], keep);
+                assert_eq!(scratch.files(), ["b.jpg", "b.mcap"]);
+            }
+            _ => {
+                assert_eq!(listed, [a, keep, c], "died after {last} steps");
+                assert_eq!(scratch.files().len(), 6, "died after {last} steps");
+            }
         }
         // The note does not outlive the next clip of the same name.
         let next = record(&mut folder, "a");
         drop(folder);
         assert!(scratch.open().1.is_empty());
-        assert!(
-            scratch.listed().contains(&next) && scratch.path(next.file.to_str().unwrap()).is_file()
-        );
+        assert!(scratch.listed().contains(&next) && scratch.0.join(&next.file).is_file());
         died += usize::from(replaced.is_err());
         if replaced.is_ok() {
             break;
@@ -170,8 +148,7 @@ fn a_replacement_that_dies_at_any_step_is_completed_or_not_begun() {
 
 #[test]
 fn a_hostile_note_deletes_no_more_than_a_list_does() {
-    let scratch = TestDir::new();
-    let (mut folder, _) = scratch.open();
+    let (scratch, mut folder) = opened();
     let clip = record(&mut folder, "a");
     drop(folder);
     let victims = ["x.mcap", "clips/notes.txt"].map(|name| scratch.path(name));
@@ -189,8 +166,7 @@ fn a_hostile_note_deletes_no_more_than_a_list_does() {
 
 #[test]
 fn lines_of_other_programs_survive_a_replacement() {
-    let scratch = TestDir::new();
-    let (mut folder, _) = scratch.open();
+    let (scratch, mut folder) = opened();
     let [a, _] = ["a", "b"].map(|base| record(&mut folder, base));
     let list = scratch.path("clips.jsonl");
     let own = fs::read_to_string(&list).unwrap();
@@ -222,17 +198,11 @@ fn lines_of_other_programs_survive_a_replacement() {
 
 #[test]
 fn the_longest_possible_line_can_be_read_again() {
-    let scratch = TestDir::new();
-    let (mut folder, _) = scratch.open();
+    let (scratch, mut folder) = opened();
     // No character takes more room in JSON than a control character.
     let name = |n: u64| format!("{}{n:04}", "\u{1}".repeat(1020));
-    let topic = |n: u64| TopicSchema {
-        name: name(n),
-        type_name: name(n),
-        definitions: None,
-        offered_qos: None,
-        other_definitions: Vec::new(),
-    };
+    let topic =
+        |n: u64| TopicSchema { name: name(n), type_name: name(n), ..TopicSchema::default() };
     assert!(topic(1).check().is_ok());
     let counts = |n| ClipTopicCounts {
         topic: name(n),
@@ -263,8 +233,7 @@ fn the_longest_possible_line_can_be_read_again() {
 
 #[test]
 fn a_hostile_list_deletes_nothing_outside() {
-    let scratch = TestDir::new();
-    let (mut folder, _) = scratch.open();
+    let (scratch, mut folder) = opened();
     let clip = record(&mut folder, "a");
     let victims =
         ["x.mcap", "x.jpg", "clips/notes.txt", "clips/deep/y.mcap"].map(|name| scratch.path(name));
@@ -299,10 +268,15 @@ fn a_hostile_list_deletes_nothing_outside() {
     }
 }
 
+/// Returns the file of the only loss, which is a deletion.
+fn deleted(reported: &[Loss]) -> &str {
+    let [Loss::Deleted { file, .. }] = reported else { panic!("{reported:?}") };
+    file.to_str().unwrap()
+}
+
 #[test]
 fn a_clip_that_cannot_be_deleted_is_reported_once_and_the_next_one_is_deleted() {
-    let scratch = TestDir::new();
-    let (mut folder, _) = scratch.open();
+    let (scratch, mut folder) = opened();
     assert!(folder.keep_at_most(Some(2), None).unwrap().is_empty());
     let mut added = |base: &str| {
         let clip = record(&mut folder, base);
@@ -320,29 +294,15 @@ fn a_clip_that_cannot_be_deleted_is_reported_once_and_the_next_one_is_deleted() 
     };
     assert_eq!((file.to_str(), gone.to_str()), (Some("clips/a.mcap"), Some("clips/b.mcap")));
     assert!(reason.contains("cannot remove") && reason.contains("a.mcap"), "{reason}");
-    assert!(
-        scratch.files().contains(&"c.mcap".to_owned())
-            && !scratch.files().contains(&"b.mcap".to_owned())
-    );
+    let has = |name: &str| scratch.files().iter().any(|file| file == name);
+    assert!(has("c.mcap") && !has("b.mcap"));
     // Both stay on the list, and the limit holds as far as possible.
     let reported = added("d");
-    assert!(
-        matches!(
-            &reported[..],
-            [Loss::Deleted { file, .. }] if file.to_str() == Some("clips/c.mcap")
-        ),
-        "{reported:?}"
-    );
+    assert_eq!(deleted(&reported), "clips/c.mcap");
     fs::remove_dir(&stuck).unwrap();
     fs::rename(&aside, &stuck).unwrap();
     let reported = added("e");
-    assert!(
-        matches!(
-            &reported[..],
-            [Loss::Deleted { file, .. }] if file.to_str() == Some("clips/a.mcap")
-        ),
-        "{reported:?}"
-    );
+    assert_eq!(deleted(&reported), "clips/a.mcap");
     let noted = fs::read_to_string(scratch.path("losses.jsonl")).unwrap();
     let noted: Vec<Loss> = noted.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     let names = noted.iter().map(|loss| match loss {

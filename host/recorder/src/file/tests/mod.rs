@@ -7,33 +7,36 @@ mod write;
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicU32, Ordering};
 
 use gleaner_lambda::manifest::LambdaKind;
 use gleaner_lambda::{Clip, ClipLambda, Moment, Recovered, TriggerKind};
-use gleaner_messages::Endian;
 use gleaner_transport::{Guid, SampleMeta};
 
 use super::{
     ClipHeader, ClipTopicCounts, ClipTrailer, RecordingFolder, TopicSchema, UnfinishedClip,
 };
+use crate::support::TestDir;
 
-/// A folder for one test, removed when the test ends.
-struct TestDir(PathBuf);
+/// Returns a folder of clips, and the test's folder that has it.
+fn opened() -> (TestDir, RecordingFolder) {
+    let scratch = TestDir::new();
+    let (folder, _) = scratch.open();
+    (scratch, folder)
+}
+
+/// Begins a clip, with messages `0..messages` of the IMU.
+fn begun(folder: &mut RecordingFolder, base: &str, messages: u64) -> UnfinishedClip {
+    let mut clip = folder.begin(base, &clip_header()).unwrap();
+    add(&mut clip, 0, messages);
+    clip
+}
+
+/// Records a clip of six messages.
+fn record(folder: &mut RecordingFolder, base: &str) -> Clip {
+    begun(folder, base, 6).finish(trailer()).unwrap()
+}
 
 impl TestDir {
-    fn new() -> Self {
-        static COUNT: AtomicU32 = AtomicU32::new(0);
-        let name = format!(
-            "gleaner-recorder-{}-{}",
-            std::process::id(),
-            COUNT.fetch_add(1, Ordering::Relaxed)
-        );
-        let folder = std::env::temp_dir().join(name);
-        fs::create_dir(&folder).unwrap();
-        Self(folder)
-    }
-
     fn path(&self, relative: &str) -> PathBuf {
         self.0.join(relative)
     }
@@ -55,12 +58,6 @@ impl TestDir {
         let mut names: Vec<_> = names.filter(|name| name != ".lock").collect();
         names.sort();
         names
-    }
-}
-
-impl Drop for TestDir {
-    fn drop(&mut self) {
-        let _ = fs::remove_dir_all(&self.0);
     }
 }
 
@@ -95,33 +92,18 @@ fn imu() -> TopicSchema {
         type_name: "sensor_msgs/msg/Imu".to_owned(),
         definitions: Some("float64 x".into()),
         offered_qos: Some("- history: 3".to_owned()),
-        other_definitions: Vec::new(),
+        ..TopicSchema::default()
     }
 }
 
 fn camera() -> TopicSchema {
     let (name, type_name) = ("/camera".to_owned(), "sensor_msgs/msg/Image".to_owned());
-    TopicSchema {
-        name,
-        type_name,
-        definitions: None,
-        offered_qos: None,
-        other_definitions: Vec::new(),
-    }
+    TopicSchema { name, type_name, ..TopicSchema::default() }
 }
 
 fn meta(at_ns: i64, seq: u64) -> SampleMeta {
     let writer = Guid(*b"a writer of imus");
-    SampleMeta {
-        at_ns,
-        publish_ns: at_ns - 7,
-        writer,
-        seq,
-        endian: Endian::Little,
-        options: [0; 2],
-        layout: 0,
-        is_latched: false,
-    }
+    SampleMeta { publish_ns: at_ns - 7, ..SampleMeta::new(at_ns, writer, seq) }
 }
 
 /// Returns the payload of message `n`; no two are equal.

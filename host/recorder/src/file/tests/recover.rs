@@ -6,16 +6,14 @@ use std::path::Path;
 use super::super::UnfinishedClip;
 use super::super::clip_dir::{AGAIN, CLIP, PART};
 use super::super::durable::steps;
+use super::super::recover::Recovery;
 use super::*;
 use crate::error::RecordError;
 
 /// Returns the bytes of an unfinished clip of `messages` messages, some of them in an open chunk.
 fn part(messages: u64) -> Vec<u8> {
-    let scratch = TestDir::new();
-    let (mut folder, _) = scratch.open();
-    let mut clip = folder.begin("a", &clip_header()).unwrap();
-    add(&mut clip, 0, messages);
-    drop(clip);
+    let (scratch, mut folder) = opened();
+    drop(begun(&mut folder, "a", messages));
     fs::read(scratch.path("clips/a.mcap.part")).unwrap()
 }
 
@@ -31,6 +29,15 @@ fn died(part: &[u8]) -> TestDir {
 /// messages: five per second.
 fn closed(messages: u64) -> u64 {
     messages.saturating_sub(1) / 5 * 5
+}
+
+fn files(clips: &[Clip]) -> Vec<&str> {
+    clips.iter().map(|clip| clip.file.to_str().unwrap()).collect()
+}
+
+/// Returns the recovery of unfinished clips.
+fn recovery(scratch: &TestDir) -> Recovery {
+    RecordingFolder::open_without_recovery(&scratch.0).unwrap().take_unfinished()
 }
 
 /// Returns whether `numbers` are those of the first messages, without a gap.
@@ -63,10 +70,8 @@ fn a_recovered_clip_describes_itself_and_what_is_missing() {
     assert_eq!((clip.from_ns, clip.to_ns), (10 * SECOND, stamp(9)));
     assert_eq!((clip.first_ns, clip.last_ns), (Some(stamp(0)), Some(stamp(9))));
     assert_eq!((clip.triggers, clip.moments.as_slice()), (1, &[moment(12 * SECOND)][..]));
-    assert_eq!(
-        (clip.topics[0].messages, clip.topics[0].received, clip.topics[0].too_big),
-        (10, None, None)
-    );
+    let topic = &clip.topics[0];
+    assert_eq!((topic.messages, topic.received, topic.too_big), (10, None, None));
     assert_eq!(clip.bytes, fs::metadata(scratch.path("clips/a.mcap")).unwrap().len());
     let recovered = clip.recovered.as_ref().unwrap();
     assert_eq!(recovered.lost_bytes, 3);
@@ -124,11 +129,8 @@ fn a_flipped_byte_never_gives_a_broken_clip() {
 /// unchanged.
 #[test]
 fn a_finished_file_that_was_not_renamed_is_recovered_completely() {
-    let source = TestDir::new();
-    let (mut folder, _) = source.open();
-    let mut clip = folder.begin("a", &clip_header()).unwrap();
-    add(&mut clip, 0, 6);
-    let finished = clip.finish(trailer()).unwrap();
+    let (source, mut folder) = opened();
+    let finished = record(&mut folder, "a");
     let whole = fs::read(source.path("clips/a.mcap")).unwrap();
     for len in (0..whole.len()).step_by(7).chain([whole.len()]) {
         let scratch = died(&whole[..len]);
@@ -152,11 +154,8 @@ fn a_finished_file_that_was_not_renamed_is_recovered_completely() {
 /// Returns the folder of a recorder that died after it had finished a clip, before the rename; the
 /// clip as the next start lists it; and the bytes of its file.
 fn died_before_the_rename() -> (TestDir, Clip, Vec<u8>) {
-    let source = TestDir::new();
-    let (mut folder, _) = source.open();
-    let mut clip = folder.begin("a", &clip_header()).unwrap();
-    add(&mut clip, 0, 6);
-    let finished = clip.finish(trailer()).unwrap();
+    let (source, mut folder) = opened();
+    let finished = record(&mut folder, "a");
     let whole = fs::read(source.path("clips/a.mcap")).unwrap();
     let scratch = died(&whole);
     fs::write(scratch.path("clips/a.jpg"), b"a picture").unwrap();
@@ -197,8 +196,7 @@ fn a_finished_file_is_recovered_once_even_if_its_recovery_dies_at_every_step() {
         let mut is_done = false;
         for _ in 0..2 {
             steps::restart(last);
-            let mut recovery =
-                RecordingFolder::open_without_recovery(&scratch.0).unwrap().take_unfinished();
+            let mut recovery = recovery(&scratch);
             is_done =
                 std::iter::from_fn(|| recovery.next(&mut || true)).all(|result| result.is_ok());
         }
@@ -286,8 +284,7 @@ fn an_empty_unfinished_clip_is_removed_and_a_file_of_another_program_is_not() {
 
 #[test]
 fn several_unfinished_clips_are_recovered_in_the_order_of_their_names() {
-    let scratch = TestDir::new();
-    let (mut folder, _) = scratch.open();
+    let (scratch, mut folder) = opened();
     let mut open: Vec<UnfinishedClip> =
         ["b", "a", "b"].map(|base| folder.begin(base, &clip_header()).unwrap()).into();
     for clip in &mut open {
@@ -295,8 +292,7 @@ fn several_unfinished_clips_are_recovered_in_the_order_of_their_names() {
     }
     drop((folder, open));
     let (_, found) = scratch.open();
-    let files: Vec<_> = found.iter().map(|clip| clip.file.to_str().unwrap()).collect();
-    assert_eq!(files, ["clips/a.mcap", "clips/b.mcap", "clips/b-2.mcap"]);
+    assert_eq!(files(&found), ["clips/a.mcap", "clips/b.mcap", "clips/b-2.mcap"]);
 }
 
 #[test]
@@ -306,33 +302,19 @@ fn a_clip_that_cannot_be_recovered_is_left_for_a_later_start_and_does_not_stop_r
     // A folder cannot be removed like a file.
     fs::create_dir(scratch.path(&format!("clips/a{AGAIN}"))).unwrap();
     for _ in 0..2 {
-        let mut recovery =
-            RecordingFolder::open_without_recovery(&scratch.0).unwrap().take_unfinished();
+        let mut recovery = recovery(&scratch);
         let why = recovery.next(&mut || true).unwrap().unwrap_err();
-        assert!(
-            matches!(
-                &why,
-                RecordError::Recover { path, .. } if path.ends_with("clips/a.mcap.part")
-            ),
-            "{why:?}"
-        );
+        let RecordError::Recover { path, .. } = &why else { panic!("{why:?}") };
+        assert!(path.ends_with("clips/a.mcap.part"), "{why:?}");
     }
     let (mut folder, found) = scratch.open();
-    assert_eq!(
-        found.iter().map(|clip| clip.file.to_str().unwrap()).collect::<Vec<_>>(),
-        ["clips/b.mcap"]
-    );
-    let mut next = folder.begin("a", &clip_header()).unwrap();
-    add(&mut next, 0, 6);
-    assert_eq!(next.finish(trailer()).unwrap().file, Path::new("clips/a-2.mcap"));
+    assert_eq!(files(&found), ["clips/b.mcap"]);
+    assert_eq!(record(&mut folder, "a").file, Path::new("clips/a-2.mcap"));
     drop(folder);
     assert_eq!(fs::read(scratch.path("clips/a.mcap.part")).unwrap(), part(14));
     fs::remove_dir(scratch.path(&format!("clips/a{AGAIN}"))).unwrap();
     let (_, found) = scratch.open();
-    assert_eq!(
-        found.iter().map(|clip| clip.file.to_str().unwrap()).collect::<Vec<_>>(),
-        ["clips/a.mcap"]
-    );
+    assert_eq!(files(&found), ["clips/a.mcap"]);
 }
 
 #[test]
@@ -343,8 +325,7 @@ fn a_recovery_that_is_aborted_at_any_time_leaves_the_unfinished_clip() {
         let mut aborted = 0;
         for allowed in 0.. {
             let scratch = died(&left);
-            let mut recovery =
-                RecordingFolder::open_without_recovery(&scratch.0).unwrap().take_unfinished();
+            let mut recovery = recovery(&scratch);
             let mut checks = 0;
             let recovered = recovery.next(&mut || {
                 checks += 1;
@@ -373,9 +354,7 @@ fn clips_are_begun_and_finished_while_another_is_recovered() {
     let mut recovery = folder.take_unfinished();
     let mut clips = 0;
     let result = recovery.next(&mut || {
-        let mut clip = folder.begin("a", &clip_header()).unwrap();
-        add(&mut clip, 0, 6);
-        clip.finish(trailer()).unwrap();
+        record(&mut folder, "a");
         clips += 1;
         true
     });

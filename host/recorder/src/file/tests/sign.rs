@@ -40,9 +40,7 @@ fn signing(scratch: &TestDir) -> RecordingFolder {
 fn recorded(trailer: ClipTrailer) -> (TestDir, Vec<u8>, u64) {
     let scratch = TestDir::new();
     let mut folder = signing(&scratch);
-    let mut clip = folder.begin("a", &clip_header()).unwrap();
-    add(&mut clip, 0, 9);
-    let clip = clip.finish(trailer).unwrap();
+    let clip = begun(&mut folder, "a", 9).finish(trailer).unwrap();
     let bytes = fs::read(scratch.path(CLIP)).unwrap();
     assert_eq!((clip.bytes, scratch.listed()), (bytes.len() as u64, vec![clip]));
     let unsigned = folder.unsigned().load(Ordering::Relaxed);
@@ -58,9 +56,8 @@ fn a_signed_clip_is_a_usual_one_and_states_its_origin() {
     let index = summary.attachment_indexes.last().unwrap();
     assert_eq!(index.name, SIGNATURE);
     let attachment = mcap::read::attachment(&bytes, index).unwrap();
-    assert!(
-        attachment.data.starts_with(b"{\"payloadType\":\"application/vnd.gleaner.clip.v1+json")
-    );
+    let start = b"{\"payloadType\":\"application/vnd.gleaner.clip.v1+json";
+    assert!(attachment.data.starts_with(start));
     let SignedClip { statement, key: signer } = verify(&bytes).unwrap();
     assert_eq!(signer, key(7).public().id());
     let losses = &statement.losses;
@@ -168,9 +165,7 @@ fn other_keys_other_names_and_unsigned_clips_are_refused_by_what_they_are() {
     assert!(refused.to_string().contains("`car-8`, and the clip names vehicle `car-7`"));
 
     let scratch = TestDir::new();
-    let mut clip = scratch.open().0.begin("a", &clip_header()).unwrap();
-    add(&mut clip, 0, 9);
-    clip.finish(trailer()).unwrap();
+    begun(&mut scratch.open().0, "a", 9).finish(trailer()).unwrap();
     let refused = verify(&fs::read(scratch.path(CLIP)).unwrap()).unwrap_err();
     assert!(matches!(refused, ClipRefusal::Unsigned), "{refused}");
     assert!(matches!(verify(b"no mcap file"), Err(ClipRefusal::NotMcap)));

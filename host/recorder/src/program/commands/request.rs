@@ -114,19 +114,15 @@ mod tests {
         .unwrap();
         assert_eq!(request.lambda.as_deref(), Some("brake"));
         let Trigger { kind, label, score, attributes } = request.trigger;
-        assert_eq!(
-            (kind, label.as_str(), score),
-            (TriggerKind::Start, "test \u{1b}[2J", Some(100.0))
-        );
+        let expected = (TriggerKind::Start, "test \u{1b}[2J", Some(100.0));
+        assert_eq!((kind, label.as_str(), score), expected);
         assert!(attributes.is_empty());
         let request = read(r#"{"label":"x","command":"event","lambda":null}"#).unwrap();
         assert_eq!((request.lambda, request.trigger.score), (None, None));
         let mut big = message(r#"{"label":"x","command":"stop"}"#);
         big[..4].reverse();
-        assert_eq!(
-            CommandRequest::read(&big, Endian::Big).unwrap().trigger.kind,
-            TriggerKind::Stop
-        );
+        let stop = CommandRequest::read(&big, Endian::Big).unwrap();
+        assert_eq!(stop.trigger.kind, TriggerKind::Stop);
     }
 
     #[test]
@@ -151,10 +147,8 @@ mod tests {
         let label = "é".repeat(64);
         let text = |label: &str| format!(r#"{{"command":"event","label":"{label}"}}"#);
         assert_eq!(read(&text(&label)).unwrap().trigger.label, label);
-        assert_eq!(
-            refused(&text(&format!("{label}x"))),
-            "its label has 129 bytes; at most 128 are allowed"
-        );
+        let error = refused(&text(&format!("{label}x")));
+        assert_eq!(error, "its label has 129 bytes; at most 128 are allowed");
         assert!(matches!(read(&"[".repeat(4 << 10)), Err(CommandError::NoCommand { .. })));
     }
 
@@ -162,13 +156,8 @@ mod tests {
     fn broken_messages_have_no_text() {
         let good = message(r#"{"command":"event","label":"x"}"#);
         for len in 0..good.len() {
-            assert!(
-                matches!(
-                    CommandRequest::read(&good[..len], Endian::Little),
-                    Err(CommandError::NoText)
-                ),
-                "{len}"
-            );
+            let found = CommandRequest::read(&good[..len], Endian::Little);
+            assert!(matches!(found, Err(CommandError::NoText)), "{len}");
         }
         let filled = [&good[..], &[0; 3]].concat();
         assert!(CommandRequest::read(&filled, Endian::Little).is_ok());

@@ -16,14 +16,14 @@ use std::time::Duration;
 use gleaner_base::{Failure, hex};
 use gleaner_ingress::Ingress;
 use gleaner_journal::{FileDigest, JournalHeader};
-use gleaner_lambda::Clip;
 use gleaner_lambda::manifest::Limits;
+use gleaner_lambda::{Clip, TriggerKind};
 use gleaner_messages::{Definitions, Sources};
 use gleaner_protocol::Handover;
 use gleaner_protocol::ingress::{AddReader, AddTopics, IngressControl, Qos, ReceptionStatus};
 use gleaner_protocol::link::{
-    AddLambda, ControlClient, LinkError, RecorderReport, RecorderStatus, commands_grant,
-    recorded_grant,
+    AddLambda, ControlClient, LinkError, RecorderLink, RecorderReport, RecorderStatus,
+    commands_grant, recorded_grant,
 };
 use gleaner_recorder::program::{RecorderConnections, RecorderOptions, run};
 use gleaner_transport::loopback::Loopback;
@@ -33,7 +33,7 @@ use gleaner_transport::{
 };
 use sha2::{Digest, Sha256};
 
-use crate::support::{TestDir, member, meta};
+use crate::support::{TestDir, entry, member, meta};
 
 pub const TIMEOUT: Duration = Duration::from_secs(60);
 
@@ -56,15 +56,8 @@ impl FakeNetwork {
     pub fn add_other(&self, topic: &str, type_name: &str) {
         let (topic, type_name) = (topic.to_owned(), type_name.to_owned());
         let definitions_text = Some("string other\n".into());
-        let other = DiscoveredTopic {
-            topic,
-            type_name,
-            definitions_text,
-            messages: None,
-            offered_qos: None,
-            type_hash: None,
-            other_definitions: Vec::new(),
-        };
+        let other =
+            DiscoveredTopic { topic, type_name, definitions_text, ..DiscoveredTopic::default() };
         self.others.lock().unwrap().push(other);
     }
 
@@ -249,6 +242,32 @@ impl Running {
         let mut running = Running { starter, reports, thread, stop, clock };
         running.until(|report| matches!(report, RecorderReport::Ready).then_some(()));
         running
+    }
+
+    /// Starts a recorder with a topic `/a`.
+    pub fn start_with_a(scratch: &TestDir) -> (Running, FakeNetwork) {
+        let network = FakeNetwork::default();
+        network.add("/a");
+        (Running::start(scratch, &network, |_| {}), network)
+    }
+
+    /// Adds [`lambda`], and connects as its process does.
+    pub fn join(&mut self, scratch: &TestDir, name: &str, rolls_ms: (u32, u32)) -> RecorderLink {
+        let (folder, header) = lambda(scratch, name, rolls_ms);
+        let mut link = RecorderLink::new(self.add(&add(&folder)).unwrap());
+        link.hello(&header, TIMEOUT).unwrap();
+        link
+    }
+
+    /// Sends a wake with an event.
+    pub fn event(&self, link: &mut RecorderLink) {
+        link.wake(&entry(self.clock.now(), &[TriggerKind::Event]), monotonic(self.clock)).unwrap();
+    }
+
+    /// Stops the recorder.
+    pub fn stopped(mut self) -> (RecorderStatus, Result<(), Failure>) {
+        self.starter.control.stop().unwrap();
+        self.ended()
     }
 
     /// Adds a lambda as the starter does.

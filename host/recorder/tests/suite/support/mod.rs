@@ -13,7 +13,6 @@ use gleaner_journal::{
 };
 use gleaner_lambda::manifest::{LambdaKind, Manifest, Store};
 use gleaner_lambda::{Clip, Trigger, TriggerKind};
-use gleaner_messages::Endian;
 use gleaner_recorder::{
     LambdaId, LambdaSpec, Recorder, RecordingFolder, Settings, TopicId, TopicSchema,
 };
@@ -30,21 +29,33 @@ pub struct TestDir(pub PathBuf);
 impl TestDir {
     pub fn new() -> Self {
         static COUNT: AtomicU32 = AtomicU32::new(0);
-        let name = format!("core-{}-{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
+        let count = COUNT.fetch_add(1, Ordering::Relaxed);
+        let name = format!("gleaner-recorder-{}-{count}", std::process::id());
         let folder = std::env::temp_dir().join(name);
         fs::create_dir_all(&folder).unwrap();
         Self(folder)
     }
 
-    pub fn recorder(&self, settings: impl FnOnce(&mut Settings)) -> Recorder {
-        let mut given = Settings {
+    pub fn settings(&self) -> Settings {
+        Settings {
             store: Store::Ram,
             preroll_bytes: 16 << 20,
             max_length: Duration::from_secs(600),
             folder: self.0.clone(),
             clock: "log time of the drive".to_owned(),
             prefault: false,
-        };
+        }
+    }
+
+    /// Creates a folder, and a recorder in it.
+    pub fn recording() -> (Self, Recorder) {
+        let scratch = Self::new();
+        let recorder = scratch.recorder(|_| {});
+        (scratch, recorder)
+    }
+
+    pub fn recorder(&self, settings: impl FnOnce(&mut Settings)) -> Recorder {
+        let mut given = self.settings();
         settings(&mut given);
         Recorder::new(RecordingFolder::open(&self.0).unwrap().0, given).unwrap()
     }
@@ -133,8 +144,7 @@ pub fn topic(name: &str) -> TopicSchema {
         name: name.to_owned(),
         type_name: type_name.to_owned(),
         definitions: Some("int64 value\n".into()),
-        offered_qos: None,
-        other_definitions: Vec::new(),
+        ..TopicSchema::default()
     }
 }
 
@@ -190,17 +200,14 @@ cooldown = "{cooldown}ms"
     LambdaSpec { header, rules, digest: "d1e5".to_owned(), topics: topics.to_vec() }
 }
 
+/// Adds topic `/a`, and a lambda that records it.
+pub fn add_hello(recorder: &mut Recorder, rolls_ms: (i64, i64, i64)) -> (TopicId, LambdaId) {
+    let a = recorder.add_topic(topic("/a")).unwrap();
+    (a, recorder.add_lambda(member("hello", rolls_ms, &[a])))
+}
+
 pub fn meta(at_ns: i64, seq: u64) -> SampleMeta {
-    SampleMeta {
-        at_ns,
-        publish_ns: at_ns,
-        writer: Guid([7; 16]),
-        seq,
-        endian: Endian::Little,
-        options: [0; 2],
-        layout: 0,
-        is_latched: false,
-    }
+    SampleMeta::new(at_ns, Guid([7; 16]), seq)
 }
 
 pub fn entry(at_ns: i64, kinds: &[TriggerKind]) -> JournalEntry {
@@ -250,6 +257,63 @@ pub fn stamps(scratch: &TestDir, clip: &Clip, topic: &str) -> Vec<i64> {
 /// Every `every`-th number from `from` to `to`, both included.
 pub fn every(from: i64, to: i64, every: i64) -> Vec<i64> {
     (from..=to).filter(|ms| ms % every == 0).collect()
+}
+
+pub fn lambda_names(clip: &Clip) -> Vec<&str> {
+    clip.lambdas.iter().map(|lambda| lambda.name.as_str()).collect()
+}
+
+pub fn follow_each_other(numbers: &[u32]) -> bool {
+    numbers.windows(2).all(|pair| pair[1] == pair[0] + 1)
+}
+
+/// A window of a model: lambda, first and last instant.
+pub type ModelWindow = (usize, i64, i64);
+
+/// Computes groups of windows by brute force: all windows at once, then the connected ones. It has
+/// no state, and ignores the order of arrival.
+///
+/// `rolls` are preroll, postroll and cooldown of each lambda. A trigger is a stamp, the lambda and
+/// the kind.
+pub fn model_groups(
+    rolls: &[(i64, i64, i64)],
+    triggers: &[(i64, usize, TriggerKind)],
+) -> Vec<Vec<ModelWindow>> {
+    use TriggerKind::{Event, Start, Stop};
+    let mut windows = Vec::new();
+    for (lambda, (preroll, postroll, cooldown)) in rolls.iter().enumerate() {
+        let (mut opened, mut started) = (None, None);
+        for (at, _, kind) in triggers.iter().filter(|(_, owner, _)| *owner == lambda) {
+            let cool = opened.is_none_or(|opened: i64| *at >= opened + cooldown);
+            match (kind, started) {
+                (Stop, Some(from)) => {
+                    windows.push((lambda, from, at + postroll));
+                    started = None;
+                }
+                (Event, _) if cool => {
+                    windows.push((lambda, at - preroll, at + postroll));
+                    opened = Some(*at);
+                }
+                (Start, None) if cool => {
+                    started = Some(at - preroll);
+                    opened = Some(*at);
+                }
+                _ => {}
+            }
+        }
+        windows.extend(started.map(|from| (lambda, from, i64::MAX)));
+    }
+    windows.sort_by_key(|(_, from, _)| *from);
+    let mut groups: Vec<Vec<ModelWindow>> = Vec::new();
+    let mut end = i64::MIN;
+    for window in windows {
+        match groups.last_mut() {
+            Some(group) if window.1 <= end => group.push(window),
+            _ => groups.push(vec![window]),
+        }
+        end = end.max(window.2);
+    }
+    groups
 }
 
 /// Pseudo-random numbers, the same in each run (SplitMix64).

@@ -39,7 +39,6 @@ struct StoredRecords {
     lines: BTreeMap<String, Vec<(u64, StreamLine)>>,
 }
 
-/// The place where a connection is cut.
 #[derive(Clone, Copy)]
 enum LinkCut {
     /// Not before everything is stored.
@@ -201,7 +200,6 @@ fn record(stream: &str, text: &str) -> (NonZeroU8, Vec<u8>) {
     (record.kind(), record.to_payload())
 }
 
-/// Returns the next batch.
 async fn batch(frames: &mut FrameReceiver<Body>) -> Records {
     match timeout(DEADLINE, frames.recv()).await.expect("a batch comes in time") {
         Some(Body::Records(records)) => records,

@@ -7,7 +7,7 @@ mod tally;
 use std::sync::Arc;
 
 use gleaner_lambda::{Clip, Moment};
-use gleaner_transport::SampleMeta;
+use gleaner_transport::{LatchedSample, SampleMeta};
 
 use self::journals::ClipJournals;
 use self::name::clip_name;
@@ -15,7 +15,6 @@ use self::tally::TopicTally;
 use crate::RecordError;
 use crate::file::{CONTINUES, ClipHeader, ClipTrailer, names};
 use crate::preroll::{EntryMeta, Walked};
-use crate::recorder::latched::LatchedSample;
 use crate::recorder::limits::RecorderLimits;
 use crate::recorder::sources::RecordedSources;
 use crate::recorder::writer::{ClipCompletion, ClipSample, ClipWriter};
@@ -71,8 +70,9 @@ pub struct OpenClip {
     tallies: Vec<TopicTally>,
     moments: Vec<Moment>,
     journals: ClipJournals,
-    /// Topics that it has the latched samples of, and those of them that are not written yet.
-    latched_topics: Vec<usize>,
+    /// Topics that it has the latched samples of, with the time at which these were valid.
+    latched_topics: Vec<(usize, i64)>,
+    /// Those of them that are not written yet.
     latched: Vec<(usize, LatchedSample)>,
 }
 
@@ -267,13 +267,16 @@ impl OpenClip {
         Ok(())
     }
 
-    /// Returns whether it has no latched samples of a topic yet; asked once.
-    pub fn takes_latched(&mut self, topic: usize) -> bool {
-        let is_new = !self.latched_topics.contains(&topic);
-        if is_new {
-            self.latched_topics.push(topic);
+    /// Returns whether it has no latched samples of a topic that were valid at `from`; asked once.
+    /// If it began later so far, those of that time are not written, or stay.
+    pub fn takes_latched(&mut self, topic: usize, from: i64) -> bool {
+        match self.latched_topics.iter_mut().find(|(known, _)| *known == topic) {
+            Some((_, at)) if *at <= from => return false,
+            Some((_, at)) => *at = from,
+            None => self.latched_topics.push((topic, from)),
         }
-        is_new
+        self.latched.retain(|(pending, _)| *pending != topic);
+        true
     }
 
     /// Takes samples from before its begin. Alone, they are no reason for a clip.
@@ -367,6 +370,7 @@ impl OpenClip {
             let name = sources.name(*lambda);
             format!("more triggers of {name} than counted: too many waited for their clip")
         }));
+        trailer.incomplete.extend_from_slice(sources.notes());
         let (from, most) = (self.from(group), self.limits.message_bytes);
         for topic in topics {
             let short = &mut trailer.incomplete;

@@ -99,7 +99,7 @@ impl TopicTally {
             short.push(format!("{name} is latched: {samples} of it found no room"));
         }
         if !sources.has_seen(topic) {
-            short.push(format!("{name} was not published before the clip ended"));
+            short.push(format!("no message of {name} was received before the clip ended"));
         }
         let late = sources.found_at(topic).map(|at| at.saturating_sub(from));
         if let Some(late) = late.filter(|late| *late > 0) {
