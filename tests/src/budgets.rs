@@ -14,7 +14,7 @@ pub const LINES: &[(&str, usize, usize)] = &[
     ("fuzz", 4216, 86),
     ("guest-sdk-python", 5876, 4099),
     ("guest-sdk-rust", 5690, 1621),
-    ("host", 62455, 30165),
+    ("host", 62457, 30161),
     ("journal", 1869, 1266),
     ("lambda", 4610, 2186),
     ("orchestrator", 24163, 7656),
