@@ -4,7 +4,7 @@ use std::ffi::OsString;
 use std::os::unix::process::CommandExt;
 use std::process::Command;
 
-use gleaner_base::{Exit, Failure, visible};
+use gleaner_base::{Exit, Failure};
 use gleaner_parts::Parts;
 use gleaner_protocol::Report;
 use gleaner_protocol::ingress::IngressReport;
@@ -12,7 +12,7 @@ use serde::de::DeserializeOwned;
 
 use crate::args::{InspectArgs, TopicsArgs};
 use crate::render;
-use crate::replay;
+use crate::separate;
 use crate::stdout::print;
 
 /// Replaces this process by the program `name`, such as `gleaner-player`.
@@ -50,15 +50,9 @@ pub(crate) fn inspect(args: &InspectArgs) -> Result<Exit, Failure> {
         Err(exit) => return Ok(exit),
         Ok(Report::Drive(drive)) => drive,
         Ok(Report::Separate { drives }) => {
-            let mut first = Exit::Ok;
-            for (drives, name) in drives.iter().zip(replay::names(&drives)) {
-                if !args.json {
-                    print(&format!("\ndrive {}\n", visible(&name)))?;
-                }
-                let exit = inspect(&InspectArgs { drives: drives.clone(), ..*args })?;
-                first = if first == Exit::Ok { exit } else { first };
-            }
-            return Ok(first);
+            return separate::each(&drives, args.json, |drives, _| {
+                inspect(&InspectArgs { drives, ..*args })
+            });
         }
         Ok(_) => {
             return Err(Failure::new(Exit::Internal, "gleaner-runtime did not report a drive"));

@@ -30,6 +30,7 @@ mod replay;
 mod report;
 mod run;
 mod runtime;
+mod separate;
 mod signing;
 mod stdout;
 mod vehicle;

@@ -6,6 +6,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use gleaner_base::{Exit, Failure, visible};
+use gleaner_lambda::OutputLock;
 use gleaner_protocol::ReplaySummary;
 use gleaner_report::{Decisions, clips};
 use serde_json::Value;
@@ -14,6 +15,7 @@ use crate::args::{ReplayArgs, VerifyArgs};
 use crate::render::{self, Digest, Paint};
 use crate::report;
 use crate::runtime::{self, RuntimeResult};
+use crate::separate;
 use crate::signing;
 use crate::stdout::print;
 
@@ -22,15 +24,15 @@ pub(crate) fn run(args: &ReplayArgs) -> Result<Exit, Failure> {
     results(args).map(|(exit, _)| exit)
 }
 
-/// Replays. Returns the exit code of the runtime, and whether there are new results: a lambda that
+/// Replays. Returns the exit code of the runtime, and the folders of new results: a lambda that
 /// cannot start leaves the earlier ones.
-pub(crate) fn results(args: &ReplayArgs) -> Result<(Exit, bool), Failure> {
+pub(crate) fn results(args: &ReplayArgs) -> Result<(Exit, Vec<PathBuf>), Failure> {
     let (mut result, exit) =
         runtime::run(&args.target.lambda, args.target.vehicle.as_deref(), arguments(args))?;
     if let Some(RuntimeResult::Separate(drives)) = &result {
-        return each(args, drives).map(|exit| (exit, false));
+        return each(args, drives);
     }
-    let has_results = result.is_some();
+    let folders = result.iter().map(|_| out_of(args)).collect();
     if let Some(RuntimeResult::Summary(summary)) = &mut result {
         // Not the path in the report, which may come from the lambda's process.
         summary.out = out_of(args);
@@ -51,84 +53,36 @@ pub(crate) fn results(args: &ReplayArgs) -> Result<(Exit, bool), Failure> {
         // The results are complete without the report page.
         Err(failure) => {
             eprintln!("{failure}");
-            return Ok((if exit == Exit::Ok { Exit::Internal } else { exit }, has_results));
+            return Ok((if exit == Exit::Ok { Exit::Internal } else { exit }, folders));
         }
     }
-    Ok((exit, has_results))
+    Ok((exit, folders))
 }
 
 fn out_of(args: &ReplayArgs) -> PathBuf {
     args.out.clone().unwrap_or_else(|| args.target.lambda.join("out"))
 }
 
-/// Replays separate drives one by one, each with a fresh lambda. Returns the first exit code that
-/// is not 0. After an error, the others are not replayed.
-fn each(args: &ReplayArgs, drives: &[Vec<PathBuf>]) -> Result<Exit, Failure> {
+/// Replays separate drives one by one, each with a fresh lambda.
+fn each(args: &ReplayArgs, drives: &[Vec<PathBuf>]) -> Result<(Exit, Vec<PathBuf>), Failure> {
     let out = out_of(args);
-    let folder = out.join("drives");
-    let _held = hold(&folder)?;
+    let folder = separate::folder(&out);
+    let _held = OutputLock::take(&folder)?;
     if out.join("summary.json").exists() {
         eprintln!("note: the results of an earlier replay stay in `{}`", visible_path(&out));
     }
-    let mut first = Exit::Ok;
-    for (n, (drive, name)) in drives.iter().zip(names(drives)).enumerate() {
-        if !args.json {
-            print(&format!("\ndrive {}\n", visible(&name)))?;
-        }
-        let (one, out) = (drive.clone(), Some(folder.join(name)));
-        let (exit, _) = results(&ReplayArgs { drives: one, out, ..args.clone() })?;
-        first = if first == Exit::Ok { exit } else { first };
-        let is_replayed = matches!(exit, Exit::Ok | Exit::LambdaFaulted | Exit::DriveDamaged);
-        let left = drives.len() - n - 1;
-        if !is_replayed && left > 0 {
-            eprintln!("note: {left} of {} drives were not replayed", drives.len());
-            return Ok(exit);
-        }
-    }
-    Ok(first)
-}
-
-/// Creates the folder of the results of several drives, and locks it for this set.
-fn hold(folder: &Path) -> Result<fs::File, Failure> {
-    let failed = |error: &io::Error| {
-        let action = format!("cannot lock `{}`", visible_path(folder));
-        Failure::caused_by(Exit::Internal, action, error)
-    };
-    let held = fs::create_dir_all(folder).and_then(|()| fs::File::create(folder.join(".lock")));
-    let held = held.map_err(|error| failed(&error))?;
-    match held.try_lock() {
-        Ok(()) => Ok(held),
-        Err(fs::TryLockError::WouldBlock) => {
-            let message = format!("another replay writes into `{}`", visible_path(folder));
-            Err(Failure::new(Exit::Usage, message).with_help("choose another folder: --out DIR"))
-        }
-        Err(fs::TryLockError::Error(error)) => Err(failed(&error)),
-    }
+    let mut replayed = Vec::new();
+    let exit = separate::each(drives, args.json, |drives, name| {
+        let out = Some(folder.join(name));
+        let (exit, folders) = results(&ReplayArgs { drives, out, ..args.clone() })?;
+        replayed.extend(folders);
+        Ok(exit)
+    })?;
+    Ok((exit, replayed))
 }
 
 fn visible_path(path: &Path) -> String {
     visible(&path.to_string_lossy())
-}
-
-/// Most bytes of the name of a drive: a number may follow.
-const NAME_BYTES: usize = 200;
-
-/// Returns a name for each drive: that of its first file or directory, with a number if another
-/// one has it.
-pub(crate) fn names(drives: &[Vec<PathBuf>]) -> Vec<String> {
-    let mut names: Vec<String> = Vec::new();
-    for drive in drives {
-        let file = drive.first().and_then(|path| path.file_name()).unwrap_or_default();
-        let file = file.to_string_lossy();
-        let name = file.strip_suffix(".zstd").unwrap_or(&file);
-        let name = [".mcap", ".db3"].iter().find_map(|end| name.strip_suffix(end)).unwrap_or(name);
-        let name = &name[..name.floor_char_boundary(NAME_BYTES)];
-        let name = if matches!(name, "" | "." | "..") { "drive" } else { name };
-        let name: String = name.chars().map(|c| if c.is_control() { '_' } else { c }).collect();
-        let mut free = (1..).map(|n| if n == 1 { name.clone() } else { format!("{name}-{n}") });
-        names.extend(free.find(|name| !names.contains(name)));
-    }
-    names
 }
 
 /// Writes the report page into `out`, unless `no_report`. The page of an earlier replay is removed
@@ -235,13 +189,6 @@ fn arguments(args: &ReplayArgs) -> Vec<OsString> {
 mod tests {
     use super::*;
     use crate::args::LambdaArgs;
-
-    #[test]
-    fn drives_are_named_by_their_files() {
-        let drives = ["a/noon.mcap", "b/noon.mcap.zstd", "bag", "2024.01_0.db3", "...mcap", "a\n"];
-        let drives = drives.map(|path| vec![PathBuf::from(path), PathBuf::from("more.mcap")]);
-        assert_eq!(names(&drives), ["noon", "noon-2", "bag", "2024.01_0", "drive", "a_"]);
-    }
 
     #[test]
     fn the_runtime_gets_the_arguments_with_the_files_last() {

@@ -1,5 +1,5 @@
 //! `gleaner report OUT`: writes the report page, which `gleaner-report` makes, to
-//! `OUT/report.html`.
+//! `OUT/report.html`, and that of each separate drive into the folder of its results.
 
 use std::path::{Path, PathBuf};
 
@@ -7,6 +7,7 @@ use gleaner_base::{Exit, Failure, write_atomically};
 use gleaner_report::{Diff, ReportPage};
 
 use crate::args::ReportArgs;
+use crate::separate;
 use crate::stdout::print;
 
 /// File name of the page in the result folder.
@@ -14,8 +15,14 @@ pub(crate) const NAME: &str = "report.html";
 
 /// Runs `gleaner report OUT`.
 pub(crate) fn run(args: &ReportArgs) -> Result<Exit, Failure> {
-    let path = write(&args.out)?;
-    print(&format!("{}\n", path.display()))?;
+    let mut folders = separate::result_folders(&args.out);
+    if folders.is_empty() {
+        // Its error names what is missing.
+        folders.push(args.out.clone());
+    }
+    for folder in folders {
+        print(&format!("{}\n", write(&folder)?.display()))?;
+    }
     Ok(Exit::Ok)
 }
 

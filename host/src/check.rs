@@ -96,7 +96,7 @@ impl CheckJob {
             lambda: manifest.lambda.name.to_string(),
             version: manifest.lambda.version.to_string(),
             kind: manifest.lambda.kind,
-            engine: setup.guest.engine(),
+            engine: setup.guest.engine().to_string(),
             init_ms,
             resident_bytes: setup.guest.resident_bytes(),
             needs: needs(&lambda, &manifest),

@@ -8,7 +8,7 @@ use gleaner_rules::faults::Faults;
 
 use crate::api::Session;
 use crate::api::data::Wake;
-use crate::guest::{Guest, Totals};
+use crate::guest::{Guest, LambdaEngine, Totals};
 
 /// Runs one lambda and returns its decisions.
 pub struct Invoker {
@@ -93,7 +93,7 @@ impl Invoker {
     }
 
     /// The engine of the lambda, with what ran its models so far.
-    pub fn engine(&self) -> String {
+    pub fn engine(&self) -> LambdaEngine {
         self.guest.engine()
     }
 
@@ -159,8 +159,8 @@ mod tests {
             WakeOutcome { result, fuel: None, run_ns: None, model_ns: None }
         }
 
-        fn engine(&self) -> String {
-            String::new()
+        fn engine(&self) -> LambdaEngine {
+            LambdaEngine::default()
         }
     }
 

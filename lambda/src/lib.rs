@@ -9,6 +9,7 @@ pub mod layout;
 mod log_line;
 pub mod manifest;
 mod output;
+mod output_lock;
 pub mod results;
 pub mod signals;
 mod sources;
@@ -24,7 +25,8 @@ pub use decision::{
 pub use layout::{BuildDir, LayoutError};
 pub use log_line::{LogLevel, LogLine};
 pub use manifest::{Manifest, ManifestError};
-pub use output::{LOCK, Output, OutputError, RESULTS};
+pub use output::{Output, OutputError, RESULTS};
+pub use output_lock::{OutputLock, OutputLockError};
 pub use results::RESULT_ITEM_MAX;
 pub use sources::{REQUIREMENTS, SOURCE_MAX, Sources};
 pub use vehicle::{

@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
+use crate::output_lock::LOCK;
 use crate::results::LINES_MAX;
 use crate::signals::Signals;
 use crate::{Decision, LogLine, RESULT_ITEM_MAX};
@@ -25,9 +26,6 @@ const REPORT: &str = "report.html";
 
 /// Earlier lines of a rotated log.
 const PREVIOUS_LOG: &str = "log.before.jsonl";
-
-/// The lock file of a replay, so that no other replay writes into the same folder.
-pub const LOCK: &str = ".lock";
 
 /// The files of a run beside its clips.
 pub const RESULTS: [&str; 8] =

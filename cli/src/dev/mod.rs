@@ -7,7 +7,7 @@ mod watch;
 
 use std::fs;
 use std::io;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use gleaner_base::{ByteSize, Exit, Failure, PlainFile, safe_file, visible};
 use gleaner_report::Diff;
@@ -15,7 +15,7 @@ use gleaner_report::Diff;
 use crate::args::{BuildArgs, DevArgs, ReplayArgs};
 use crate::render::{self, Paint};
 use crate::stdout::print;
-use crate::{build, replay};
+use crate::{build, replay, separate};
 
 use watch::SourceSnapshot;
 
@@ -33,20 +33,26 @@ const KEPT_MAX: ByteSize = ByteSize::gib(1);
 pub(crate) fn run(args: DevArgs) -> Result<Exit, Failure> {
     let dir = args.target.lambda.clone();
     let out = args.out.clone().unwrap_or_else(|| dir.join("out"));
-    let before = out.join(BEFORE);
     let replay = replay_args(args);
     // The first comparison is with the results of an earlier session, if there are any.
-    let mut has_before = keep(&out, &before);
+    let mut kept = separate::result_folders(&out);
+    kept.retain(|out| keep(out));
     let mut sources = SourceSnapshot::of(&dir);
     loop {
         match once(&dir, &replay) {
-            Ok(true) => {
-                if has_before && let Err(failure) = compare(&before, &out) {
-                    eprintln!("{failure}");
+            Ok(folders) => {
+                let is_set = folders.len() > 1;
+                for out in folders {
+                    let has_before = kept.contains(&out);
+                    if has_before && let Err(failure) = compare(&out, is_set) {
+                        eprintln!("{failure}");
+                    }
+                    kept.retain(|folder| *folder != out);
+                    if keep(&out) {
+                        kept.push(out);
+                    }
                 }
-                has_before = keep(&out, &before);
             }
-            Ok(false) => {}
             Err(failure) => eprintln!("{failure}"),
         }
         print(&format!("\nwaiting for changes in {} (Ctrl-C ends)\n", dir.display()))?;
@@ -61,22 +67,27 @@ pub(crate) fn run(args: DevArgs) -> Result<Exit, Failure> {
     }
 }
 
-/// Builds and replays. Returns whether there are results, which is also the case for a lambda with
-/// faults and for a damaged drive.
-fn once(dir: &Path, args: &ReplayArgs) -> Result<bool, Failure> {
+/// Builds and replays. Returns the folders with new results, also those of a lambda with faults and
+/// of a damaged drive.
+fn once(dir: &Path, args: &ReplayArgs) -> Result<Vec<PathBuf>, Failure> {
     build::run(&BuildArgs { lambda: dir.to_owned(), ..BuildArgs::default() })?;
-    replay::results(args).map(|(_, has_results)| has_results)
+    replay::results(args).map(|(_, folders)| folders)
 }
 
-fn compare(before: &Path, out: &Path) -> Result<(), Failure> {
-    let mut changes = Diff::between(before, out)?;
+/// Compares results with those before. Those of one of several drives are named.
+fn compare(out: &Path, is_set: bool) -> Result<(), Failure> {
+    let mut changes = Diff::between(&out.join(BEFORE), out)?;
+    if let Some(drive) = out.file_name().filter(|_| is_set) {
+        print(&format!("\ndrive {}\n", visible(&drive.to_string_lossy())))?;
+    }
     changes.a.out = "before".to_owned();
     changes.b.out = "now".to_owned();
     print(&format!("\n{}", render::diff(&changes, Paint::of_stdout())))
 }
 
 /// Copies the results for the next comparison; returns false if they are incomplete.
-fn keep(out: &Path, before: &Path) -> bool {
+fn keep(out: &Path) -> bool {
+    let before = &out.join(BEFORE);
     let copied = || -> io::Result<()> {
         if !out.join(COMPARED[0]).is_file() {
             return Err(io::ErrorKind::NotFound.into());
@@ -134,19 +145,19 @@ mod tests {
         fs::write(&precious, "precious").unwrap();
         fs::write(out.join("summary.json"), "{}").unwrap();
         std::os::unix::fs::symlink(&precious, before.join("summary.json")).unwrap();
-        assert!(keep(&out, &before));
+        assert!(keep(&out));
         assert_eq!(fs::read_to_string(before.join("summary.json")).unwrap(), "{}");
         assert_eq!(fs::read_to_string(&precious).unwrap(), "precious");
         // Links are not read either, and a linked folder is not written to.
         fs::remove_file(out.join("summary.json")).unwrap();
         std::os::unix::fs::symlink(&precious, out.join("summary.json")).unwrap();
-        assert!(!keep(&out, &before));
+        assert!(!keep(&out));
         assert_eq!(fs::read_to_string(before.join("summary.json")).unwrap(), "{}");
         fs::remove_file(out.join("summary.json")).unwrap();
         fs::write(out.join("summary.json"), "{\"new\": 1}").unwrap();
         fs::rename(&before, folder.path().join("elsewhere")).unwrap();
         std::os::unix::fs::symlink(folder.path().join("elsewhere"), &before).unwrap();
-        assert!(!keep(&out, &before));
+        assert!(!keep(&out));
         assert_eq!(fs::read_to_string(folder.path().join("elsewhere/summary.json")).unwrap(), "{}");
     }
 }

@@ -9,7 +9,7 @@ use rustdds::DomainParticipant;
 use super::discovery;
 use super::names::{ros_type, visible};
 use super::qos::Offer;
-use gleaner_transport::Guid;
+use gleaner_transport::{Guid, SampleMeta};
 
 /// Most writers that are remembered as left out.
 const MOST_LEFT_OUT: usize = 1024;
@@ -195,7 +195,7 @@ impl TypeCheck {
 }
 
 fn number_of(offer: &Offer) -> u16 {
-    u16::from(offer.type_hash.is_some())
+    if offer.type_hash.is_some() { SampleMeta::ANNOUNCED } else { 0 }
 }
 
 fn left_out_for(offer: &Offer, type_name: &str, layout: &TopicLayout) -> Option<LeftOut> {

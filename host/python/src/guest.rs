@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use gleaner_host::api::Session;
 use gleaner_host::api::data::Wake;
 use gleaner_host::api::log::LINE_BYTES;
-use gleaner_host::guest::{Guest, WakeOutcome, is_late};
+use gleaner_host::guest::{Guest, LambdaEngine, WakeOutcome, is_late};
 use gleaner_host::session_setup::RunMode;
 use gleaner_host::{memory, program};
 use gleaner_lambda::manifest::{Limits, Manifest, ScheduleSpec};
@@ -283,7 +283,7 @@ impl Guest for PythonGuest {
         memory::trim_heap();
     }
 
-    fn engine(&self) -> String {
+    fn engine(&self) -> LambdaEngine {
         Python::attach(|py| {
             let version = Python::version_str();
             let python = version.split(' ').next().unwrap_or(version);
@@ -291,7 +291,9 @@ impl Guest for PythonGuest {
                 .host
                 .call_method0(py, "numpy_version")
                 .and_then(|version| version.extract::<String>(py));
-            format!("Python {python}, numpy {}", numpy.as_deref().unwrap_or("unknown"))
+            let numpy = numpy.as_deref().unwrap_or("unknown");
+            let name = format!("Python {python}, numpy {numpy}");
+            LambdaEngine { name, models: Vec::new() }
         })
     }
 }

@@ -7,9 +7,6 @@ use gleaner_transport::SampleMeta;
 
 use super::data::Topic;
 
-/// Number of the layout of a live sample whose writer announces one.
-const ANNOUNCED: u16 = 1;
-
 /// The layout of the definitions of a live topic. Nothing for other topics.
 #[derive(Default)]
 pub(crate) struct LiveLayout {
@@ -68,7 +65,7 @@ impl Topic {
         let from = self.live_layout.unconfirmed_from.load(Ordering::Relaxed);
         let until = self.until().min(reader.head());
         let is_announced = |position: &u64| {
-            reader.meta(*position).is_some_and(|meta| meta.sample.layout == ANNOUNCED)
+            reader.meta(*position).is_some_and(|meta| meta.sample.layout == SampleMeta::ANNOUNCED)
         };
         let first = (from.max(oldest)..until).find(is_announced);
         if first.is_none() && from < until {
@@ -78,11 +75,13 @@ impl Topic {
         first
     }
 
-    /// Hides samples whose layout may be another one than that of the definitions.
+    /// Hides samples whose layout may be another one than that of the definitions. Later samples
+    /// are shown at the wakes.
     pub(crate) fn hide_unconfirmed(&self) {
-        if self.live_layout.own.get().is_some() {
-            let from = self.live_layout.unconfirmed_from.load(Ordering::Relaxed);
-            self.hide_from(from);
+        let is_confirmed = self.live_layout.unconfirmed_from.load(Ordering::Relaxed) == u64::MAX;
+        if self.live_layout.own.get().is_some() && !is_confirmed {
+            let head = self.reader().head();
+            self.hide_from(self.first_unconfirmed().unwrap_or(head).min(head));
         }
     }
 }

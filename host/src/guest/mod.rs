@@ -14,6 +14,7 @@ mod meter;
 pub mod sandboxed;
 pub mod worker;
 
+use std::fmt;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -22,6 +23,7 @@ use gleaner_lambda::Fault;
 use gleaner_lambda::signals::Curve;
 use gleaner_protocol::Layer;
 use gleaner_vitals::usage;
+use serde::{Deserialize, Serialize};
 
 use crate::api::curves::Curves;
 use crate::api::data::{Counts, Topic, Wake};
@@ -32,6 +34,23 @@ pub fn is_late(elapsed: Duration, allowed: Duration) -> bool {
     /// Delay with which an interruption may take effect.
     const TOLERANCE: Duration = Duration::from_millis(2);
     elapsed > allowed.saturating_add(TOLERANCE)
+}
+
+/// What runs a lambda: a decision is only reproducible on the same engine. Its text has all parts,
+/// with a semicolon between them.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+pub struct LambdaEngine {
+    /// The engine, with its version.
+    pub name: String,
+    /// The runtime of each model.
+    pub models: Vec<String>,
+}
+
+impl fmt::Display for LambdaEngine {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.name)?;
+        self.models.iter().try_for_each(|model| write!(f, "; {model}"))
+    }
 }
 
 /// A lambda that can be woken.
@@ -66,9 +85,8 @@ pub trait Guest {
     /// fault but the lambda uses too much memory, and instead of a wake that cannot be repeated.
     fn discard(&mut self) {}
 
-    /// The engine that runs the lambda, with its version: a decision is only reproducible on the
-    /// same engine. The runtime of each model follows after a semicolon.
-    fn engine(&self) -> String;
+    /// Returns what runs the lambda, and its models so far.
+    fn engine(&self) -> LambdaEngine;
 
     /// The sandbox layers of the process that runs the lambda. Called before the first `init`.
     ///

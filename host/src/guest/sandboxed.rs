@@ -9,7 +9,7 @@ use gleaner_lambda::{Fault, FaultKind};
 use gleaner_protocol::{Layer, Phase};
 
 use super::meter::Meter;
-use super::{Guest, WakeOutcome};
+use super::{Guest, LambdaEngine, WakeOutcome};
 use crate::api::data::Wake;
 use crate::api::models::Models;
 use crate::isolation::Isolation;
@@ -50,7 +50,7 @@ pub struct SandboxedGuest {
     /// The models that it runs.
     models: Models,
     /// The engine without them.
-    engine: OnceLock<String>,
+    engine: OnceLock<LambdaEngine>,
     meter: Option<Meter>,
     is_prepared: bool,
     /// Set if the next wake begins with an `init`.
@@ -144,11 +144,10 @@ impl Guest for SandboxedGuest {
         self.needs_init = true;
     }
 
-    fn engine(&self) -> String {
+    fn engine(&self) -> LambdaEngine {
         // Once, before the lambda's code can run: that of Python calls into the interpreter.
-        let mut parts = vec![self.engine.get_or_init(|| self.guest.engine()).clone()];
-        parts.extend(self.models.runtimes());
-        parts.join("; ")
+        let LambdaEngine { name, .. } = self.engine.get_or_init(|| self.guest.engine()).clone();
+        LambdaEngine { name, models: self.models.runtimes() }
     }
 
     fn layers(&self) -> Result<Vec<Layer>, Failure> {

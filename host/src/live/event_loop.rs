@@ -163,7 +163,7 @@ impl LiveEventLoop {
     /// Passes the engine to the recorder: models may have been opened since.
     pub(super) fn note_engine(&mut self) {
         if let Some(recorder) = &mut self.recorder {
-            recorder.engine(self.invoker.engine());
+            recorder.engine(self.invoker.engine().to_string());
         }
     }
 

@@ -111,7 +111,7 @@ impl LiveRun<'_> {
         let recorder = match recorder {
             Some(socket) => {
                 let (build, config, remaps) = (&lambda.build, &lambda.config, &lambda.remaps);
-                let engine = guest.engine();
+                let engine = guest.engine().to_string();
                 let identity = LambdaIdentity {
                     manifest: &manifest,
                     build,

@@ -10,7 +10,6 @@ mod inspect;
 mod journal_file;
 mod open;
 mod options;
-mod output_lock;
 mod packed;
 mod pictures;
 mod record;
@@ -29,12 +28,12 @@ use std::io::Write;
 
 use gleaner_base::{Exit, Failure};
 use gleaner_drives::ReplayError;
+use gleaner_lambda::OutputLock;
 use gleaner_lambda::manifest::Manifest;
 use gleaner_protocol::Report;
 
 use self::open::DriveError;
 use self::options::{Results, Task};
-use self::output_lock::OutputLock;
 use self::round::ReplayOutcome;
 use crate::guest::worker::MessageSender;
 use crate::session_setup::Load;

@@ -25,7 +25,7 @@ use crate::api::Session;
 use crate::api::data::{Counts, Topic, Wake};
 use crate::api::log::LogLine;
 use crate::api::trace::offered;
-use crate::guest::Totals;
+use crate::guest::{LambdaEngine, Totals};
 use crate::invoker::Invoker;
 use crate::journal::{EntryBuilder, IdentityError, LambdaIdentity};
 use crate::schedule::WakeSchedule;
@@ -267,10 +267,9 @@ pub(super) fn replay(
     let SessionSetup { inputs, session, mut guest } =
         SessionSetup::load(&mut drive, &options.lambda, manifest, RunMode::Replay, load)?;
     let engine = guest.engine();
-    let models = models_of(&engine);
     let has_header = results.journal.is_some() || recording.is_some();
     let header =
-        has_header.then(|| journal_header(&options.lambda, manifest, engine, part)).transpose()?;
+        has_header.then(|| journal_header(&options.lambda, manifest, &engine, part)).transpose()?;
     // Its preroll is allocated before `init`, from which on memory counts as the lambda's.
     if let (Some(recording), Some(header)) = (&mut recording, &header) {
         recording.start(&results.out, header)?;
@@ -333,7 +332,7 @@ pub(super) fn replay(
         broken: broken.as_ref(),
         recorded,
         totals: &totals,
-        models,
+        models: engine.models,
         wall_s: started.elapsed().as_secs_f64(),
     };
     let summary = replay_loop.summary(options, &results.out, manifest, end);
@@ -346,19 +345,15 @@ pub(super) fn replay(
     Ok(ReplayOutcome { summary, broken: broken.map(|error| error.exit()), incomplete })
 }
 
-/// Returns the part of an engine's name for each model.
-fn models_of(engine: &str) -> Vec<String> {
-    engine.split("; ").filter(|part| part.starts_with("model ")).map(str::to_owned).collect()
-}
-
 /// Describes the lambda, for the journal and for clips.
 fn journal_header(
     lambda: &ConfiguredLambda,
     manifest: &Manifest,
-    engine: String,
+    engine: &LambdaEngine,
     part: TimeRange,
 ) -> Result<JournalHeader, IdentityError> {
     let ConfiguredLambda { build, config, remaps, .. } = lambda;
+    let engine = engine.to_string();
     LambdaIdentity { manifest, build, config, remaps, engine, clock: CLOCK, part }.header()
 }
 

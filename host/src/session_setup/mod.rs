@@ -13,7 +13,7 @@ use gleaner_lambda::manifest::Manifest;
 use gleaner_messages::Sources;
 use gleaner_transport::Transport;
 
-pub use gleaner_lambda::{LOCK, Output, OutputError, RESULTS};
+pub use gleaner_lambda::{Output, OutputError, RESULTS};
 pub(crate) use lambda_args::take_stdin;
 pub use lambda_args::{ConfiguredLambda, LambdaArgs, tighten};
 

@@ -14,6 +14,7 @@ use gleaner_protocol::ingress::{AddReader, IngressControl, TopicGrant};
 use gleaner_transport::loopback::Loopback;
 use gleaner_transport::{Guid, SampleMeta};
 
+use crate::live::{Announced, LAYOUT, WrittenLoopback};
 use crate::meta;
 
 const TYPE: &str = "test_msgs/msg/Number";
@@ -46,7 +47,10 @@ impl FedInputs {
             TopicGrant::for_input(id, input, input.topic.as_str(), id == 0, false)
         };
         let topics = (0..).zip(&manifest.inputs).map(grant).collect();
-        let (mut control, ingress) = Ingress::start_in_thread(Box::new(loopback.clone()));
+        // The layout is known from the start, so samples need no wake to be shown.
+        let announced = Announced::new(Some(LAYOUT.to_owned()).into());
+        let source = WrittenLoopback(loopback.clone(), announced);
+        let (mut control, ingress) = Ingress::start_in_thread(Box::new(source));
         let added = AddReader { name: "many".to_owned(), topics, publishes: Vec::new() };
         let mut feed = Feed::connect(control.add_reader(&added).unwrap()).unwrap();
         let sources = Sources::new(&[], &[]);

@@ -16,7 +16,7 @@ use gleaner_feed::Feed;
 use gleaner_host::api::Session;
 use gleaner_host::api::data::{Sample, Wake};
 use gleaner_host::api::models::Models;
-use gleaner_host::guest::{Guest, WakeOutcome};
+use gleaner_host::guest::{Guest, LambdaEngine, WakeOutcome};
 use gleaner_host::live::{LiveRun, ResultsPipe, Settings};
 use gleaner_host::session_setup::ConfiguredLambda;
 use gleaner_ingress::Ingress;
@@ -84,16 +84,19 @@ impl Guest for NumbersGuest {
         self.kept.clear();
     }
 
-    fn engine(&self) -> String {
-        "a test".to_owned()
+    fn engine(&self) -> LambdaEngine {
+        LambdaEngine { name: "a test".to_owned(), models: Vec::new() }
     }
 }
 
-/// The hash that writers of [`NUMBERS`] have announced.
+/// Hash of the layout "int64 value", by rosbags.
+pub const LAYOUT: &str = "RIHS01_376752aeb9e256c4e2313368a5a32645d62041d37777621433ea5e52e280b5ea";
+
+/// The hash that writers have announced.
 pub type Announced = Arc<Mutex<Option<String>>>;
 
 /// A loopback with a writer of each topic, which loses nothing itself.
-struct WrittenLoopback(Loopback, Announced);
+pub struct WrittenLoopback(pub Loopback, pub Announced);
 
 impl Transport for WrittenLoopback {
     fn topics(&self) -> Vec<DiscoveredTopic> {

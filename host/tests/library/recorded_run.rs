@@ -16,7 +16,7 @@ use gleaner_feed::Feed;
 use gleaner_host::api::Session;
 use gleaner_host::api::data::Wake;
 use gleaner_host::api::models::Models;
-use gleaner_host::guest::{Guest, WakeOutcome};
+use gleaner_host::guest::{Guest, LambdaEngine, WakeOutcome};
 use gleaner_host::live::{LiveRun, ResultsPipe, Settings};
 use gleaner_host::replay::{ReplayJob, VerifyArgs};
 use gleaner_host::session_setup::{ConfiguredLambda, RunMode};
@@ -93,8 +93,8 @@ impl Guest for AddingGuest {
         self.sum = None;
     }
 
-    fn engine(&self) -> String {
-        "a test".to_owned()
+    fn engine(&self) -> LambdaEngine {
+        LambdaEngine { name: "a test".to_owned(), models: Vec::new() }
     }
 }
 

@@ -71,7 +71,8 @@ pub struct SampleMeta {
     /// Bytes 2 and 3 of the encapsulation header, nearly always zeros. Unused, but with them a
     /// recorder can write the original message byte for byte.
     pub options: [u8; 2],
-    /// Number of its layout among those of its topic: that of [`Definitions::layouts`].
+    /// Number of its layout among those of its topic: that of [`Definitions::layouts`]. Live, it is
+    /// [`Self::ANNOUNCED`] if the writer announces one, else 0.
     pub layout: u16,
     /// True for a sample from before a clip that was still valid at its begin, which is then its
     /// time: that of a topic with durability transient local.
@@ -79,6 +80,9 @@ pub struct SampleMeta {
 }
 
 impl SampleMeta {
+    /// Number of the layout of live samples whose writers announce one.
+    pub const ANNOUNCED: u16 = 1;
+
     /// Metadata of a little-endian sample in the first layout of its topic, published at `at_ns`,
     /// in ns. Other fields are set with `..`.
     pub fn new(at_ns: i64, writer: Guid, seq: u64) -> SampleMeta {

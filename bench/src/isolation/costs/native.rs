@@ -10,7 +10,7 @@ use std::sync::Arc;
 use gleaner_host::api::Session;
 use gleaner_host::api::data::{DataError, Field, Sample, Topic, Wake};
 use gleaner_host::api::trigger::{Attribute, AttributeValue, TriggerError};
-use gleaner_host::guest::{Guest, WakeOutcome};
+use gleaner_host::guest::{Guest, LambdaEngine, WakeOutcome};
 use gleaner_lambda::manifest::ConfigValue;
 use gleaner_lambda::{Fault, FaultKind};
 use gleaner_sdk::kernels::fft::SpectrumError;
@@ -123,8 +123,8 @@ impl Guest for NativeGuest {
         WakeOutcome { result, fuel: None, run_ns: None, model_ns: None }
     }
 
-    fn engine(&self) -> String {
-        "native".to_owned()
+    fn engine(&self) -> LambdaEngine {
+        LambdaEngine { name: "native".to_owned(), models: Vec::new() }
     }
 }
 

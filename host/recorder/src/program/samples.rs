@@ -6,9 +6,6 @@ use std::sync::Arc;
 use gleaner_feed::FedTopic;
 use gleaner_transport::{SampleMeta, StoredMeta, TopicCounters};
 
-/// Number of the layout of a live sample whose writer announces none.
-const UNANNOUNCED: u16 = 0;
-
 /// Attempts to find a sample that stays until it is looked at: the ingress publishes meanwhile.
 const ATTEMPTS: u32 = 8;
 
@@ -60,7 +57,9 @@ impl FedSamples {
             return false;
         }
         let words = self.fed.reader.meta(self.next);
-        words.is_some_and(|words| StoredMeta::of_words(&words).sample.layout != UNANNOUNCED)
+        words.is_some_and(|words| {
+            StoredMeta::of_words(&words).sample.layout == SampleMeta::ANNOUNCED
+        })
     }
 
     /// Sets the layout that writers announce. Without one, no definitions fit.
@@ -139,7 +138,7 @@ impl FedSamples {
         for sample in held.iter() {
             let meta = StoredMeta::of_words(sample.meta()).sample;
             let is_known = self.fed.info.is_recorded || self.fed.info.type_hash.is_some();
-            if meta.at_ns > until_ns || meta.layout != UNANNOUNCED && !is_known {
+            if meta.at_ns > until_ns || meta.layout == SampleMeta::ANNOUNCED && !is_known {
                 self.ahead = Some(meta.at_ns);
                 break;
             }

@@ -32,7 +32,7 @@ use self::bindings::gleaner::lambda::data as wit;
 use self::bindings::{ConfigEntry, ConfigValue as WitConfigValue, Lambda};
 use self::limits::Caps;
 use self::wasi::GuestOutput;
-use super::{Guest, WakeOutcome};
+use super::{Guest, LambdaEngine, WakeOutcome};
 use crate::api::Session;
 use crate::api::data::Wake;
 
@@ -172,8 +172,8 @@ impl Guest for WasmGuest {
         self.live = None;
     }
 
-    fn engine(&self) -> String {
-        self.loaded.settings().to_owned()
+    fn engine(&self) -> LambdaEngine {
+        LambdaEngine { name: self.loaded.settings().to_owned(), models: Vec::new() }
     }
 }
 

@@ -27,6 +27,7 @@ pub use sender::{MessageSender, SendingGuest};
 
 use crate::api::data::Counts;
 use crate::api::log::Level;
+use crate::guest::LambdaEngine;
 
 /// Maximum length of a message in bytes: a wake with the maximum of triggers and attributes, each
 /// character escaped, has some 2 MB.
@@ -38,7 +39,7 @@ const MESSAGE_MAX: u64 = 4 << 20;
 #[serde(rename_all = "snake_case")]
 enum WorkerMessage {
     /// Sent first: the process is sandboxed, and no code of the lambda has run yet.
-    Ready { engine: String, layers: Vec<Layer> },
+    Ready { engine: LambdaEngine, layers: Vec<Layer> },
     /// A line that the lambda logged; sent before the message of the call that it belongs to.
     Log { level: Level, message: String },
     /// The start-up code of the lambda's environment has ended.

@@ -17,7 +17,7 @@ use crate::api::Session;
 use crate::api::data::{Counts, Topic, Wake};
 use crate::api::log::{LINE_BYTES, Level, cut};
 use crate::api::trace::offered;
-use crate::guest::{Guest, Totals, WakeOutcome};
+use crate::guest::{Guest, LambdaEngine, Totals, WakeOutcome};
 
 /// A guest in a worker.
 pub struct RemoteGuest {
@@ -26,7 +26,7 @@ pub struct RemoteGuest {
     /// The fault with which it ended early.
     fault: Option<Fault>,
     session: Session,
-    engine: String,
+    engine: LambdaEngine,
     layers: Vec<Layer>,
     /// The next message, if it was read ahead.
     read: Option<CallMessages>,
@@ -313,7 +313,7 @@ impl Guest for RemoteGuest {
         !is_skipped
     }
 
-    fn engine(&self) -> String {
+    fn engine(&self) -> LambdaEngine {
         self.engine.clone()
     }
 

@@ -13,7 +13,7 @@ use gleaner_vitals::usage;
 use super::{CallOutcome, TotalsMessage, WakeMessage, WorkerMessage};
 use crate::api::Session;
 use crate::api::data::Wake;
-use crate::guest::{Guest, Totals, WakeOutcome};
+use crate::guest::{Guest, LambdaEngine, Totals, WakeOutcome};
 
 /// The writing end of a worker's messages.
 #[derive(Clone)]
@@ -176,7 +176,7 @@ impl Guest for SendingGuest {
         self.guest.discard();
     }
 
-    fn engine(&self) -> String {
+    fn engine(&self) -> LambdaEngine {
         self.guest.engine()
     }
 }

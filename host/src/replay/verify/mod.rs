@@ -104,7 +104,7 @@ impl Rerun {
         let SessionSetup { inputs, session, mut guest } =
             SessionSetup::load(&mut drive, &options.lambda, manifest, RunMode::Replay, load)?;
         let lambda = manifest.lambda.name.to_string();
-        reference.engine_now = Some(guest.engine());
+        reference.engine_now = Some(guest.engine().to_string());
         let initialised = guest.init();
         // The log of `init` belongs to no wake.
         let (init_log, _) = session.take_log();

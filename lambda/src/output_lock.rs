@@ -8,26 +8,41 @@ use std::path::{Path, PathBuf};
 use gleaner_base::safe_file::{self, UnsafePath};
 use gleaner_base::{Exit, Explain};
 
-use crate::session_setup::LOCK;
+/// Name of the file that is locked.
+pub(crate) const LOCK: &str = ".lock";
 
-/// The lock on the folder of the results, held until it is dropped.
-pub(super) struct OutputLock {
+/// The lock on a folder of results, held until it is dropped.
+pub struct OutputLock {
     _lock: File,
 }
 
 /// A folder that cannot be locked.
 #[derive(Debug, thiserror::Error)]
-pub(super) enum OutputLockError {
+pub enum OutputLockError {
+    /// Another process holds the lock.
     #[error("another replay writes into `{}`", folder.display())]
-    Busy { folder: PathBuf },
+    Busy {
+        /// The folder.
+        folder: PathBuf,
+    },
+    /// The folder or its lock file cannot be used.
     #[error("cannot lock `{}`", path.display())]
-    Lock { path: PathBuf, source: io::Error },
+    Lock {
+        /// The lock file.
+        path: PathBuf,
+        /// The cause.
+        source: io::Error,
+    },
 }
 
 impl OutputLock {
     /// Creates `out` if necessary, and locks it. The lock file stays: its removal could remove the
     /// lock of another replay.
-    pub(super) fn take(out: &Path) -> Result<Self, OutputLockError> {
+    ///
+    /// # Errors
+    ///
+    /// [`OutputLockError`].
+    pub fn take(out: &Path) -> Result<Self, OutputLockError> {
         let path = out.join(LOCK);
         let lock = match fs::create_dir_all(out).and_then(|()| safe_file::write(&path)) {
             Ok(lock) => lock,
