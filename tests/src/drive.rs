@@ -6,6 +6,7 @@ use std::path::PathBuf;
 
 use mcap::records::MessageHeader;
 
+use crate::peers::message::MessageType;
 use crate::{TempFolder, sample_drive};
 
 /// `sensor_msgs/msg/Image` as ROS 2 defines it.
@@ -100,6 +101,30 @@ pub fn of_topics(folder: &TempFolder, topics: &[TopicMessages]) -> PathBuf {
     writer.finish().expect("a complete drive");
     drop(writer);
     folder.write("made.mcap", file.into_inner())
+}
+
+/// Writes a drive with the latched topic `/imu`: messages 1 to `count` of [`MessageType::Imu`], one
+/// each second from 1 s on, in a chunk each.
+pub fn latched_imu(folder: &TempFolder, count: u32) -> PathBuf {
+    let mut file = Cursor::new(Vec::new());
+    let options = mcap::WriteOptions::new().compression(None);
+    let mut writer = options.create(&mut file).expect("a drive in memory");
+    let (type_name, text) = (MessageType::Imu.name(), TopicMessages::sample_imu().schema);
+    let schema = writer.add_schema(&type_name, "ros2msg", text.as_bytes()).expect("a schema");
+    let qos = "- depth: 100\n  durability: transient_local\n".to_owned();
+    let qos = [("offered_qos_profiles".to_owned(), qos)].into();
+    let channel_id = writer.add_channel(schema, "/imu", "cdr", &qos).expect("a channel");
+    for sequence in 1..=count {
+        let log_time = 1_000_000_000 * u64::from(sequence);
+        let header = MessageHeader { channel_id, sequence, log_time, publish_time: log_time };
+        let cdr = MessageType::Imu.message(sequence).cdr();
+        let data = [&[0, 1, 0, 0], cdr.as_slice()].concat();
+        writer.write_to_known_channel(&header, &data).expect("a message");
+        writer.flush().expect("a chunk");
+    }
+    writer.finish().expect("a complete drive");
+    drop(writer);
+    folder.write("latched.mcap", file.into_inner())
 }
 
 /// Writes a drive with only the IMU of the sample drive, `times` times in a row, 40.1 s apart.

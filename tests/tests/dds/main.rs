@@ -18,6 +18,7 @@ mod together;
 use std::process::{ExitCode, Stdio};
 use std::sync::{PoisonError, RwLock};
 
+use gleaner_tests::live::no_player;
 use gleaner_tests::namespace;
 use gleaner_tests::peers::PeerKind;
 use libtest_mimic::{Arguments, Failed, Trial};
@@ -26,6 +27,7 @@ use libtest_mimic::{Arguments, Failed, Trial};
 #[derive(Copy, Clone)]
 enum Need {
     Peer(PeerKind),
+    Player,
     /// Rules that drop packets.
     Nft,
     /// A program that takes real-time priority, and one that gives a capability up.
@@ -90,6 +92,7 @@ fn run(case: &DdsCase) -> Result<(), Failed> {
 fn unavailable(case: &DdsCase) -> Option<&'static str> {
     let missing = |need: &Need| match need {
         Need::Peer(kind) => kind.unavailable(),
+        Need::Player => no_player(),
         Need::Nft => (!can_filter()).then_some("cannot drop packets: nft is needed"),
         Need::RealTime => real_time::unavailable(),
     };

@@ -1,8 +1,11 @@
-//! Peers receive the messages that Gleaner writes.
+//! Peers receive the messages that Gleaner and its player write.
 
 use std::thread;
 use std::time::{Duration, Instant};
 
+use gleaner_tests::TempFolder;
+use gleaner_tests::drive::latched_imu;
+use gleaner_tests::live::play;
 use gleaner_tests::peers::message::MessageType;
 use gleaner_tests::peers::{PATIENCE, Peer, PeerEvent, PeerKind};
 use libtest_mimic::Failed;
@@ -69,6 +72,11 @@ pub const CASES: &[DdsCase] = &[
         needs: &[Need::Peer(PeerKind::Python)],
         run: || received_by(PeerKind::Python, MessageType::Imu),
     },
+    DdsCase {
+        name: "cyclone_receives_what_a_played_drive_has_latched_before_the_start",
+        needs: &[Need::Peer(PeerKind::Cyclone), Need::Player],
+        run: played_from_a_start,
+    },
 ];
 
 const COUNT: u32 = 200;
@@ -107,7 +115,12 @@ fn received_by(kind: PeerKind, ty: MessageType) -> Result<(), Failed> {
         thread::sleep((Duration::from_millis(10) * n).saturating_sub(started.elapsed()));
         writer.write(&ty.message(n).cdr())?;
     }
-    for n in 1..=COUNT {
+    all_of(&mut peer, ty, COUNT)
+}
+
+/// Waits for messages 1 to `count`.
+fn all_of(peer: &mut Peer, ty: MessageType, count: u32) -> Result<(), Failed> {
+    for n in 1..=count {
         let (seq, sum) = peer.wait(&format!("message {n}"), |event| match event {
             PeerEvent::Sample { seq, sum, .. } if seq < FIRST_BEFORE => Some((seq, sum)),
             _ => None,
@@ -117,4 +130,19 @@ fn received_by(kind: PeerKind, ty: MessageType) -> Result<(), Failed> {
         }
     }
     Ok(())
+}
+
+fn played_from_a_start() -> Result<(), Failed> {
+    let folder = TempFolder::new();
+    let drive = latched_imu(&folder, 30);
+    let subscriber = || {
+        let options = "--durability transient_local";
+        Peer::start(PeerKind::Cyclone.subscriber(MessageType::Imu, "/imu", options))
+    };
+    let mut early = subscriber();
+    let path = drive.to_str().ok_or("the folder has no plain path")?;
+    // Messages 1 to 5 come before it.
+    let _player = play(&[path, "--start", "4.5", "--stamp", "recorded", "--wait", "1"]);
+    all_of(&mut early, MessageType::Imu, 6)?;
+    all_of(&mut subscriber(), MessageType::Imu, 6)
 }

@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use gleaner_tests::drive::latched_imu;
 use gleaner_tests::readers::compare_clips;
 use gleaner_tests::{LambdaCopy, ReplayRun, TempFolder, replay_to, root, verify_clip};
 use libtest_mimic::{Failed, Trial};
@@ -25,6 +26,7 @@ pub fn trials() -> Vec<Trial> {
         Trial::test("one_odd_message_or_topic_costs_no_other", odd_topics),
         Trial::test("an_empty_file_of_a_recording_is_skipped", empty_file),
         Trial::test("two_drives_of_one_time_are_refused_unless_merged", two_drives),
+        Trial::test("damage_before_a_part_is_not_reported_as_its_end", damaged_before),
     ]
 }
 
@@ -142,4 +144,29 @@ fn two_drives() -> Result<(), Failed> {
     same(&(run.exit, run.stderr.contains("pass --merge")), &(2, true))?;
     let run = replay_to(out.path(), lambda.path(), &drives, &["--no-record", "--merge"]);
     same(&(run.exit, values(&run).len()), &(0, 20))
+}
+
+fn damaged_before() -> Result<(), Failed> {
+    let lambda = reader("/imu", "sensor_msgs/msg/Imu", "linear_acceleration.x");
+    let (folder, out) = (TempFolder::new(), TempFolder::new());
+    let drive = latched_imu(&folder, 10);
+    let part = || {
+        let args = ["--from", "5", "--no-record"];
+        replay_to(out.path(), lambda.path(), std::slice::from_ref(&drive), &args)
+    };
+    // By the formula of these messages: the 26th number after the header.
+    let expected =
+        |from: u32| (from..=10).map(|n| format!("{}.25", 100 * n + 25)).collect::<Vec<_>>();
+    let whole = part();
+    same(&(whole.exit, values(&whole)), &(0, expected(1)))?;
+    let mut bytes = std::fs::read(&drive)?;
+    let first = bytes.windows(8).position(|window| window == b"frame_1\0");
+    bytes[first.ok_or("the first message is not there")?] ^= 1;
+    std::fs::write(&drive, bytes)?;
+    let damaged = part();
+    same(&(damaged.exit, values(&damaged)), &(7, expected(6)))?;
+    // What is missing came before: nothing later is lost.
+    let shown = damaged.summary.and_then(|summary| summary.damaged).unwrap_or_default();
+    let is_right = shown.contains("latched") && !shown.contains("later messages are lost");
+    if is_right { Ok(()) } else { Err(shown.into()) }
 }

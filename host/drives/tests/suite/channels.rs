@@ -8,7 +8,7 @@ use gleaner_transport::{DiscoveredTopic, Guid, Transport};
 
 use crate::support::{
     MAGIC, TEXT, TYPE, Written, add_channel, begin, file, finish, listen, record, run, run_whole,
-    text, write, write_data,
+    spec, text, write, write_data,
 };
 
 const CLAIM: &str = "00112233445566778899aabbccddeeff";
@@ -150,6 +150,32 @@ fn a_topic_has_the_qos_of_its_first_channel_that_has_one() {
         drive_of(&[("/a", key, &fits), ("/a", key, "z"), ("/b", key, "z"), ("/c", "", "")], 0);
     assert_eq!(qos(std::slice::from_ref(&first)), [None, Some("- depth: 1\n".to_owned())]);
     assert_eq!(qos(&[first, second]), [Some(fits), Some("- depth: 1\n".to_owned()), None]);
+}
+
+#[test]
+fn a_stated_hash_of_a_type_is_compared_only_if_it_has_the_form_of_one() {
+    /// Of "int64 value", by rosbags.
+    const DIGITS: &str = "376752aeb9e256c4e2313368a5a32645d62041d37777621433ea5e52e280b5ea";
+    let other = DIGITS.replace('7', "a");
+    for (stated, is_read) in [
+        (format!("RIHS01_{DIGITS}"), true),
+        (format!("RIHS01_{other}"), false),
+        // ROS 2 writes small digits, and reads both (rosidl_parse_type_hash_string).
+        (format!("RIHS01_{}", DIGITS.to_uppercase()), true),
+        (format!("RIHS01_{}", other.to_uppercase()), false),
+        // The rest is no hash of this kind, and says nothing about the definition.
+        (String::new(), true),
+        (other.clone(), true),
+        (format!("rihs01_{other}"), true),
+        (format!("RIHS02_{other}"), true),
+        (format!("RIHS01_{}", &other[1..]), true),
+        (format!("RIHS01_{other}0"), true),
+        (format!("RIHS01_{}", other.replace('6', "g")), true),
+    ] {
+        let drive = drive_of(&[("/a", "topic_type_hash", &stated)], 0);
+        let found = Replay::open(&[drive]).unwrap().can_subscribe(&spec("/a"));
+        assert_eq!(found.is_ok(), is_read, "{stated}: {found:?}");
+    }
 }
 
 /// Returns the damage and the topics of a file that ends after one channel, whose record ends with

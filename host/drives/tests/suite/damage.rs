@@ -1,12 +1,12 @@
 //! Tests damaged drives: all promised messages come first, then one error with position and cause.
 
-use gleaner_drives::{Damage, DriveLimits, Replay};
+use gleaner_drives::{Damage, DriveLimits, DriveOptions, Replay};
 use mcap::WriteOptions;
 use mcap::records::ChunkIndex;
 
 use crate::support::{
-    TEXT, Written, add_channel, begin, damage, drive, expected, file, finish, listen, replayed,
-    run, run_whole, small_chunks, ticking, write, write_data,
+    TEXT, TYPE, Written, add_channel, begin, damage, drive, expected, file, finish, listen,
+    replayed, run, run_whole, small_chunks, ticking, write, write_data,
 };
 
 const TOPICS: [&str; 2] = ["/a", "/b"];
@@ -194,6 +194,46 @@ fn a_chunk_beyond_the_limit_is_refused() {
     assert!(steps.is_empty());
     let what = damage(error).1;
     assert!(matches!(what, Damage::ChunkTooLarge { claimed: 10_001.., allowed: 10_000 }), "{what}");
+}
+
+#[test]
+fn damage_before_a_part_costs_its_latched_samples_alone_and_is_reported_at_its_end() {
+    const FROM: i64 = 2500;
+    let mut writer = begin();
+    let schema = writer.add_schema(TYPE, "ros2msg", TEXT.as_bytes()).unwrap();
+    let qos = "- durability: transient_local\n".to_owned();
+    let qos = [("offered_qos_profiles".to_owned(), qos)].into();
+    let map = writer.add_channel(schema, "/map", "cdr", &qos).unwrap();
+    let a = add_channel(&mut writer, "/a", TEXT);
+    let messages = ticking(&["/a"], 300, 1000);
+    for (n, message) in messages.iter().enumerate() {
+        write(&mut writer, if [0, 70].contains(&n) { map } else { a }, message);
+    }
+    let bytes = finish(writer);
+    let of_part = || expected(&messages).into_iter().filter(|(at, _)| *at >= FROM);
+    let (mut with, mut without) = (0, 0);
+    for (bad, _) in chunks(&bytes).iter().filter(|(bad, _)| bad.message_end_time < FROM as u64) {
+        let mut bytes = bytes.clone();
+        bytes[(bad.chunk_start_offset + bad.chunk_length) as usize - 20] ^= 0x10;
+        let paths = [file(&bytes)];
+        let mut replay = Replay::open(&paths).unwrap();
+        replay.restrict(FROM, i64::MAX);
+        replay.begin_with_latched(&paths, &DriveOptions::default());
+        let memory = listen(&mut replay, &["/map", "/a"]);
+        let (_, error) = run(&mut replay);
+        if bad.message_index_offsets.contains_key(&map) {
+            with += 1;
+            // The lost one may have replaced the other: neither is known to be valid.
+            assert_eq!(memory.values(), of_part().collect::<Vec<_>>());
+            assert_eq!(damage(error).0, bad.chunk_start_offset);
+        } else {
+            without += 1;
+            let latched = [(FROM, 0), (FROM, 70)].into_iter();
+            assert_eq!(memory.values(), latched.chain(of_part()).collect::<Vec<_>>());
+            assert!(error.is_none(), "{error:?}");
+        }
+    }
+    assert!(with == 2 && without > 5, "{with}, {without}");
 }
 
 #[test]

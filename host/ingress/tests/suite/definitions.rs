@@ -12,10 +12,13 @@ use gleaner_transport::{
     Subscription, TopicSpec, Transport, TransportError,
 };
 
-use crate::support::{RunningIngress, TIMEOUT, grant};
+use crate::support::{RunningIngress, TIMEOUT, TYPE, grant};
 
 /// Time of a query, which no node answers.
 const QUERY: Duration = Duration::from_millis(20);
+
+/// The layout of all topics of the source.
+const LAYOUT: &str = "RIHS01_376752aeb9e256c4e2313368a5a32645d62041d37777621433ea5e52e280b5ea";
 
 /// A source without definitions, which sends one query at a time.
 struct SlowNodes {
@@ -74,6 +77,10 @@ impl LiveSource for SlowNodes {
         self.loopback.unsubscribe(subscription);
     }
 
+    fn layout(&self, _: Subscription) -> Option<String> {
+        Some(LAYOUT.to_owned())
+    }
+
     fn publisher(
         &self,
         topic: &str,
@@ -107,4 +114,20 @@ fn a_reader_with_many_unknown_types_does_not_keep_others_from_a_query() {
     let sent = sent.lock().unwrap();
     let turn = sent.iter().position(|type_name| *type_name == format!("car_msgs/msg/T{TYPES}"));
     assert!(turn.is_some_and(|turn| turn < 20), "{sent:?}");
+}
+
+#[test]
+fn the_layout_of_a_topic_is_named_only_to_readers_with_a_grant_of_it() {
+    let loopback = Loopback::new();
+    loopback.add_topic("/number", TYPE, "");
+    let (queries, sent) = (Mutex::default(), Arc::default());
+    let mut ingress = RunningIngress::over(SlowNodes { loopback, queries, sent });
+    let mut honest = ingress.reading("honest", grant(7, "/number"));
+    let mut stranger = ingress.reader("stranger", Vec::new());
+    for id in [0, 1, 7, 8, u32::MAX] {
+        assert_eq!(stranger.layout(id, TIMEOUT).unwrap(), None, "{id}");
+        let named = honest.feed.layout(id, TIMEOUT).unwrap();
+        assert_eq!(named.as_deref(), (id == 7).then_some(LAYOUT), "{id}");
+    }
+    ingress.status(|status| status.readers == 2);
 }

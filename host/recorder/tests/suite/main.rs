@@ -5,6 +5,7 @@ mod commands;
 mod in_the_way;
 mod kills;
 mod late;
+mod layouts;
 mod live;
 mod preroll;
 mod process;

@@ -43,6 +43,8 @@ pub struct FakeNetwork {
     pub loopback: Loopback,
     /// The subscriptions.
     pub specs: Arc<Mutex<Vec<TopicSpec>>>,
+    /// The hash of the layout that writers announce.
+    pub announced: Arc<Mutex<Option<String>>>,
     /// Other types of a topic, by other writers.
     others: Arc<Mutex<Vec<DiscoveredTopic>>>,
 }
@@ -102,6 +104,10 @@ impl Transport for FakeNetwork {
 
 impl LiveSource for FakeNetwork {
     fn unsubscribe(&mut self, _: Subscription) {}
+
+    fn layout(&self, _: Subscription) -> Option<String> {
+        self.announced.lock().unwrap().clone()
+    }
 
     fn health(&self) -> Health {
         self.loopback.health()
