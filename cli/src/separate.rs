@@ -72,6 +72,8 @@ fn names(drives: &[Vec<PathBuf>]) -> Vec<String> {
 
 #[cfg(test)]
 mod tests {
+    use gleaner_lambda::{OutputLock, OutputLockError};
+
     use super::*;
 
     #[test]
@@ -79,5 +81,20 @@ mod tests {
         let drives = ["a/noon.mcap", "b/noon.mcap.zstd", "bag", "2024.01_0.db3", "...mcap", "a\n"];
         let drives = drives.map(|path| vec![PathBuf::from(path), PathBuf::from("more.mcap")]);
         assert_eq!(names(&drives), ["noon", "noon-2", "bag", "2024.01_0", "drive", "a_"]);
+    }
+
+    #[test]
+    fn results_are_locked_without_following_links() {
+        let out = tempfile::tempdir().unwrap();
+        let (folder, precious) = (folder(out.path()), out.path().join("precious"));
+        drop(OutputLock::take(&folder).unwrap());
+        let held = OutputLock::take(&folder).unwrap();
+        assert!(matches!(OutputLock::take(&folder), Err(OutputLockError::Busy { .. })));
+        drop(held);
+        fs::write(&precious, "precious").unwrap();
+        fs::remove_file(folder.join(".lock")).unwrap();
+        std::os::unix::fs::symlink(&precious, folder.join(".lock")).unwrap();
+        assert!(matches!(OutputLock::take(&folder), Err(OutputLockError::Lock { .. })));
+        assert_eq!(fs::read_to_string(&precious).unwrap(), "precious");
     }
 }

@@ -312,7 +312,7 @@ fn write_faults(text: &mut String, faults: u64, digest: &Digest, paint: Paint) -
 /// Writes the reason why the results end before the drive, if they do.
 fn write_early_end(text: &mut String, summary: &ReplaySummary, paint: Paint) -> fmt::Result {
     if let Some(damage) = &summary.damaged {
-        writeln!(text, "  {}", paint.red("the drive is damaged; the results end there"))?;
+        writeln!(text, "  {}", paint.red("the drive is damaged"))?;
         for line in damage.lines() {
             writeln!(text, "    {}", visible(line))?;
         }

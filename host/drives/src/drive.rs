@@ -70,7 +70,7 @@ pub struct Replay {
     opened: Option<(Vec<PathBuf>, DriveOptions)>,
     /// These samples, which come first.
     latched: VecDeque<EarlierSample>,
-    /// The damage before the part to replay for which there are none.
+    /// The error before the part to replay for which there are none.
     without_latched: Option<ReplayError>,
     opener: Opener,
     /// Unpacks messages that are packed one by one.

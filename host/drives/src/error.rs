@@ -188,6 +188,13 @@ pub enum ReplayError {
         #[source]
         what: Damage,
     },
+    /// The drive cannot be read before the part to replay. That part was replayed in full, without
+    /// latched samples from before it.
+    #[error("latched samples from before the replayed part are missing")]
+    WithoutLatched {
+        /// The error before that part.
+        source: Box<ReplayError>,
+    },
 }
 
 impl ReplayError {
@@ -269,6 +276,7 @@ impl ReplayError {
                 "a recorder that was killed leaves such a file; `mcap recover {}` repairs it",
                 word(path)
             ),
+            Self::WithoutLatched { source } => return source.help(),
             Self::Empty { .. } => "remove it from the command, or from metadata.yaml".to_owned(),
             _ => return None,
         })
@@ -278,6 +286,7 @@ impl ReplayError {
     pub fn exit(&self) -> Exit {
         match self {
             Self::Damaged { .. } => Exit::DriveDamaged,
+            Self::WithoutLatched { source } => source.exit(),
             Self::Read { .. } | Self::Unpack { .. } | Self::NoRoom { .. } => Exit::Internal,
             _ => Exit::Usage,
         }

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Explain, Failure};
-use gleaner_drives::{Progress, Replay, ReplayStep};
+use gleaner_drives::{Progress, Replay, ReplayError, ReplayStep};
 use gleaner_journal::{JournalEnd, JournalHeader, TimeRange};
 use gleaner_lambda::FaultKind;
 use gleaner_lambda::manifest::Manifest;
@@ -217,8 +217,10 @@ impl ReplayLoop<'_> {
             models,
             clips_replaced: self.clips_replaced,
             damaged: broken.map(|error| {
-                let mut failure = Failure::because("the drive could not be read to its end", error);
-                failure.causes.push(read_so_far(drive, at_ns));
+                let mut failure = Failure::because("the drive could not be read in full", error);
+                if !matches!(error.0, ReplayError::WithoutLatched { .. }) {
+                    failure.causes.push(read_so_far(drive, at_ns));
+                }
                 failure.to_string()
             }),
             stopped: self.stopped.clone(),

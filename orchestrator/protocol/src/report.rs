@@ -164,7 +164,7 @@ pub struct ReplaySummary {
     pub recording: RecordingCounts,
     /// Number of clips of an earlier replay that were deleted from the same folder.
     pub clips_replaced: u64,
-    /// The damage of the drive, if any; the results end there.
+    /// The damage of the drive, if any, and what was read.
     pub damaged: Option<String>,
     /// The reason why the lambda's process stopped before the end of the drive, if it did; the
     /// results end there.

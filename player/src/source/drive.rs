@@ -40,11 +40,7 @@ impl Explain for DriveError {
     }
 
     fn exit(&self) -> Exit {
-        match self.0 {
-            ReplayError::Damaged { .. } => Exit::DriveDamaged,
-            ReplayError::Read { .. } | ReplayError::Unpack { .. } => Exit::Internal,
-            _ => Exit::Usage,
-        }
+        self.0.exit()
     }
 }
 

@@ -83,7 +83,7 @@ function banners(page) {
   const all = (page.diff?.notes ?? []).map((note) => banner("banner", "", note));
   page.runs.forEach((run, index) => {
     const name = several ? `${"AB"[index]}: ` : "";
-    if (run.damaged) all.push(banner("banner bad", `${name}The drive is damaged; the results end there. `, run.damaged));
+    if (run.damaged) all.push(banner("banner bad", `${name}The drive is damaged. `, run.damaged));
     if (run.stopped) all.push(banner("banner bad", `${name}The lambda's process ended before the drive did; the results end there. `, run.stopped));
     run.notes.forEach((note) => all.push(banner("banner", "", name + note)));
     const { shown, total } = { shown: run.triggers.length, total: run.totals.triggers };

@@ -85,7 +85,7 @@ fn add_warnings(a: &RunSummary, b: &RunSummary, notes: &mut Vec<String>) {
     }
     for (name, summary) in [("first", a), ("second", b)] {
         if summary.damaged.is_some() {
-            notes.push(format!("the drive of the {name} is damaged; its results end there"));
+            notes.push(format!("the drive of the {name} is damaged"));
         }
     }
 }

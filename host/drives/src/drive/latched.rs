@@ -58,7 +58,8 @@ impl Replay {
         while let Some(step) = drive.step().transpose() {
             if let Err(error) = step {
                 // A later sample may have replaced those that were read.
-                self.without_latched = Some(error);
+                self.without_latched =
+                    Some(ReplayError::WithoutLatched { source: Box::new(error) });
                 return Ok(());
             }
         }

@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 
 use gleaner_base::visible;
 use gleaner_feed::{FedTopic, FeedError, FeedEvent, LastingFeed};
+use gleaner_messages::type_description::type_hash;
 use gleaner_protocol::ReceptionGaps;
 use gleaner_protocol::ingress::{ReceptionStatus, RefusedTopic, SourceStatus};
 use gleaner_protocol::link::{COMMANDS_ID, RecordedTopic};
@@ -320,7 +321,9 @@ impl Topics {
             offered_qos: fed.samples.offered_qos().map(str::to_owned),
         };
         fed.description = Description::Settled;
-        fed.described = fed.samples.type_hash().map(str::to_owned);
+        // If writers announce none, a later one may announce this.
+        let own = || type_hash(&schema.type_name, schema.definitions.as_deref()?).ok();
+        fed.described = fed.samples.type_hash().map(str::to_owned).or_else(own);
         if let Err(why) = recorder.found_topic(*topic, schema, fed.since_ns) {
             error!(error = &why as &dyn std::error::Error, "cannot record a topic");
         }

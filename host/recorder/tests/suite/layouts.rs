@@ -52,13 +52,14 @@ fn definitions_of(layouts: &[u16], hash: &str, is_early: bool) -> Vec<String> {
 
 #[test]
 fn each_live_sample_is_recorded_with_the_definition_of_its_layout_or_with_none() {
-    let cases: [(&[u16], &str, bool, &[&str]); 6] = [
+    let cases: [(&[u16], &str, bool, &[&str]); 7] = [
         (&[0], "", false, &[LOCAL]),
         (&[1, 1], OF_NODES, true, &[NODES, NODES]),
         (&[1, 1], OF_NODES, false, &[NODES, NODES]),
         (&[1], OF_LOCAL, true, &[LOCAL]),
         (&[1], OF_LOCAL, false, &[LOCAL]),
         // The topic has the definition of the first.
+        (&[0, 1], OF_LOCAL, false, &[LOCAL, LOCAL]),
         (&[0, 1], OF_NODES, false, &[LOCAL, ""]),
     ];
     // They mostly wait for reports.
