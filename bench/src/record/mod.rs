@@ -139,18 +139,8 @@ fn header() -> JournalHeader {
         machine: std::env::consts::ARCH.to_owned(),
         lambda: "load".to_owned(),
         version: "0.1.0".to_owned(),
-        kind: gleaner_lambda::manifest::LambdaKind::Wasm,
-        files: Vec::new(),
-        models: Vec::new(),
-        manifest: String::new(),
-        inputs: Vec::new(),
-        event_input: None,
-        config: serde_json::Map::new(),
-        remaps: Vec::new(),
         clock: "monotonic".to_owned(),
-        part: Default::default(),
-        wakes_before: 0,
-        limits: Default::default(),
+        ..JournalHeader::default()
     }
 }
 

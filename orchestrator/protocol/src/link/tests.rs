@@ -13,7 +13,7 @@ use crate::LinkLosses;
 use gleaner_journal::{
     InputView, JournalEntry, JournalHeader, JournalInput, LogDigest, WakeSource,
 };
-use gleaner_lambda::manifest::{LambdaKind, Limits};
+use gleaner_lambda::manifest::Limits;
 use gleaner_lambda::{Fault, FaultKind, Trigger, TriggerKind};
 
 pub(super) const TIMEOUT: Duration = Duration::from_secs(60);
@@ -31,18 +31,10 @@ pub(super) fn header(lambda: &str) -> JournalHeader {
         machine: "x".to_owned(),
         lambda: lambda.to_owned(),
         version: "0.1.0".to_owned(),
-        kind: LambdaKind::Wasm,
-        files: Vec::new(),
-        models: Vec::new(),
-        manifest: String::new(),
         inputs: vec![input],
         event_input: Some(0),
-        config: serde_json::Map::new(),
-        remaps: Vec::new(),
         clock: "x".to_owned(),
-        part: Default::default(),
-        wakes_before: 0,
-        limits: Default::default(),
+        ..JournalHeader::default()
     }
 }
 

@@ -185,17 +185,10 @@ cooldown = "{cooldown}ms"
         lambda: name.to_owned(),
         version: "1.2.3".to_owned(),
         kind: LambdaKind::Python,
-        files: Vec::new(),
-        models: Vec::new(),
-        manifest: String::new(),
         inputs: vec![input],
         event_input: Some(0),
-        config: serde_json::Map::new(),
-        remaps: Vec::new(),
         clock: "log time of the drive".to_owned(),
-        part: Default::default(),
-        wakes_before: 0,
-        limits: Default::default(),
+        ..JournalHeader::default()
     };
     LambdaSpec { header, rules, digest: "d1e5".to_owned(), topics: topics.to_vec() }
 }
