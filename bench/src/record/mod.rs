@@ -9,7 +9,7 @@ mod inline;
 mod process;
 
 use gleaner_bench_results::{Figure, quantile};
-use gleaner_journal::{InputView, JournalEntry, JournalHeader, LogDigest, WakeSource};
+use gleaner_journal::{JournalEntry, JournalHeader};
 use gleaner_lambda::manifest::Store;
 use gleaner_lambda::{Trigger, TriggerKind};
 use gleaner_transport::{Guid, SampleMeta};
@@ -153,11 +153,8 @@ fn wake(at_ns: i64, triggers: bool) -> JournalEntry {
     };
     JournalEntry {
         at_ns,
-        cause: WakeSource::Tick { missed: 0 },
-        seen: Vec::<InputView>::new(),
         triggers: if triggers { vec![trigger] } else { Vec::new() },
-        fault: None,
         fuel: Some(1000),
-        log: LogDigest::default(),
+        ..JournalEntry::default()
     }
 }

@@ -110,10 +110,8 @@ pub(super) fn entries() -> Vec<JournalEntry> {
         at_ns: 1_500_000_000_000_000_000 + 100_000_000 * seq as i64,
         cause: WakeSource::Sample { writer: [7; 16], seq },
         seen: vec![seen(seq), seen(10 * seq)],
-        triggers: Vec::new(),
-        fault: None,
         fuel: Some(250_000 + seq),
-        log: LogDigest::default(),
+        ..JournalEntry::default()
     };
     let mut attributes = Map::new();
     attributes.insert("speed".to_owned(), json!([1.5, -0.0, null, "text", { "a": 1e300 }]));

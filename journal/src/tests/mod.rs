@@ -157,10 +157,8 @@ fn usual_entries(inputs: usize, n: usize) -> Vec<JournalEntry> {
                 at_ns: 1_533_199_000_000_000_000 + index as i64 * step_ns + jitter_ns,
                 cause: WakeSource::Sample { writer: [7; 16], seq },
                 seen,
-                triggers: Vec::new(),
-                fault: None,
                 fuel: Some(250_000 + random.below(20_000)),
-                log: LogDigest::default(),
+                ..JournalEntry::default()
             }
         })
         .collect()

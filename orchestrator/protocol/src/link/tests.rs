@@ -10,9 +10,7 @@ use std::time::Duration;
 use super::frame::{self, tag};
 use super::*;
 use crate::LinkLosses;
-use gleaner_journal::{
-    InputView, JournalEntry, JournalHeader, JournalInput, LogDigest, WakeSource,
-};
+use gleaner_journal::{InputView, JournalEntry, JournalHeader, JournalInput, WakeSource};
 use gleaner_lambda::manifest::Limits;
 use gleaner_lambda::{Fault, FaultKind, Trigger, TriggerKind};
 
@@ -50,9 +48,8 @@ pub(super) fn entry(at_ns: i64, label: Option<&str>) -> JournalEntry {
         cause: WakeSource::Sample { writer: [7; 16], seq: at_ns as u64 },
         seen: vec![InputView { new: 1, digest: 5, newest: Some(([7; 16], 1)), reach: 2 }],
         triggers: label.map(trigger).into_iter().collect(),
-        fault: None,
         fuel: Some(9),
-        log: LogDigest::default(),
+        ..JournalEntry::default()
     }
 }
 

@@ -8,9 +8,7 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
 
-use gleaner_journal::{
-    InputView, JournalEntry, JournalHeader, JournalInput, JournalReader, LogDigest, WakeSource,
-};
+use gleaner_journal::{InputView, JournalEntry, JournalHeader, JournalInput, JournalReader};
 use gleaner_lambda::manifest::{LambdaKind, Manifest, Store};
 use gleaner_lambda::{Clip, Trigger, TriggerKind};
 use gleaner_recorder::{
@@ -212,12 +210,9 @@ pub fn entry(at_ns: i64, kinds: &[TriggerKind]) -> JournalEntry {
     };
     JournalEntry {
         at_ns,
-        cause: WakeSource::Tick { missed: 0 },
         seen: vec![InputView::default()],
         triggers: kinds.iter().map(trigger).collect(),
-        fault: None,
-        fuel: None,
-        log: LogDigest::default(),
+        ..JournalEntry::default()
     }
 }
 
