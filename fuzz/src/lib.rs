@@ -50,92 +50,33 @@ pub struct Target {
     pub words: &'static [&'static str],
 }
 
+/// The target with the parts of this name, for inputs of so many KiB.
+macro_rules! target {
+    ($name:ident, $kib:literal) => {
+        Target {
+            name: stringify!($name),
+            check: Some($name::check),
+            longest: $kib << 10,
+            seeds: seeds::$name::all,
+            words: seeds::$name::WORDS,
+        }
+    };
+}
+
 /// All targets.
 pub const TARGETS: [Target; 13] = [
-    Target {
-        name: "message",
-        check: Some(message::check),
-        longest: 4 << 10,
-        seeds: seeds::message::all,
-        words: seeds::message::WORDS,
-    },
-    Target {
-        name: "drive",
-        check: Some(drive::check),
-        longest: 8 << 10,
-        seeds: seeds::drive::all,
-        words: seeds::drive::WORDS,
-    },
-    Target {
-        name: "bag",
-        check: Some(bag::check),
-        longest: 8 << 10,
-        seeds: seeds::bag::all,
-        words: seeds::bag::WORDS,
-    },
-    Target {
-        name: "image",
-        check: Some(image::check),
-        longest: 4 << 10,
-        seeds: seeds::image::all,
-        words: seeds::image::WORDS,
-    },
-    Target {
-        name: "fleet",
-        check: Some(fleet::check),
-        longest: 2 << 10,
-        seeds: seeds::fleet::all,
-        words: seeds::fleet::WORDS,
-    },
-    Target {
-        name: "journal",
-        check: Some(journal::check),
-        longest: 4 << 10,
-        seeds: seeds::journal::all,
-        words: seeds::journal::WORDS,
-    },
-    Target {
-        name: "link",
-        check: Some(link::check),
-        longest: 4 << 10,
-        seeds: seeds::link::all,
-        words: seeds::journal::WORDS,
-    },
-    Target {
-        name: "ingress",
-        check: Some(ingress::check),
-        longest: 4 << 10,
-        seeds: seeds::ingress::all,
-        words: seeds::ingress::WORDS,
-    },
-    Target {
-        name: "manifest",
-        check: Some(manifest::check),
-        longest: 4 << 10,
-        seeds: seeds::manifest::all,
-        words: seeds::manifest::WORDS,
-    },
-    Target {
-        name: "trust",
-        check: Some(trust::check),
-        longest: 4 << 10,
-        seeds: seeds::trust::all,
-        words: seeds::trust::WORDS,
-    },
-    Target {
-        name: "model",
-        check: Some(model::check),
-        longest: 4 << 10,
-        seeds: seeds::model::all,
-        words: seeds::model::WORDS,
-    },
-    Target {
-        name: "spool",
-        check: Some(spool::check),
-        longest: 4 << 10,
-        seeds: seeds::spool::all,
-        words: seeds::spool::WORDS,
-    },
+    target!(message, 4),
+    target!(drive, 8),
+    target!(bag, 8),
+    target!(image, 4),
+    target!(fleet, 2),
+    target!(journal, 4),
+    target!(link, 4),
+    target!(ingress, 4),
+    target!(manifest, 4),
+    target!(trust, 4),
+    target!(model, 4),
+    target!(spool, 4),
     Target {
         name: "calls",
         #[cfg(feature = "calls")]

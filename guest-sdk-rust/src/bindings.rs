@@ -1,5 +1,5 @@
 //! Bindings to the host for a component. Only this crate uses them; natively
-//! `testing::bindings` replaces them.
+//! `testing::bindings` replaces all but their data types.
 //!
 //! `cargo xtask bless` makes this file of `wit/` with wit-bindgen.
 #![allow(unsafe_code, missing_docs, clippy::all, clippy::undocumented_unsafe_blocks)]

@@ -50,6 +50,12 @@ pub mod bindings;
 mod config;
 pub mod data;
 mod error;
+// The same file: natively, only its data types are used.
+#[allow(dead_code, unused_imports, clippy::too_many_lines)]
+#[cfg(not(target_family = "wasm"))]
+#[path = "bindings.rs"]
+#[rustfmt::skip]
+mod generated;
 pub mod inference;
 pub mod kernels;
 mod lambda;

@@ -109,19 +109,7 @@ impl Invoker {
 }
 
 fn cause(wake: &Wake) -> Decision {
-    let mut decision = Decision {
-        at_ns: wake.at_ns(),
-        cause: Cause::Tick,
-        input: None,
-        topic: None,
-        writer: None,
-        seq: None,
-        triggers: Vec::new(),
-        fault: None,
-        fuel: None,
-        run_ns: 0,
-        model_ns: 0,
-    };
+    let mut decision = Decision { at_ns: wake.at_ns(), cause: Cause::Tick, ..Decision::default() };
     if let Wake::Event(sample) = wake {
         let meta = sample.meta();
         decision.cause = Cause::Event;

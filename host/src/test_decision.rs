@@ -7,17 +7,5 @@ pub(crate) fn triggered(at_ns: i64) -> Decision {
     let attributes = serde_json::Map::new();
     let trigger =
         Trigger { kind: TriggerKind::Event, label: "x".to_owned(), score: None, attributes };
-    Decision {
-        at_ns,
-        cause: Cause::Tick,
-        input: None,
-        topic: None,
-        writer: None,
-        seq: None,
-        triggers: vec![trigger],
-        fault: None,
-        fuel: None,
-        run_ns: 0,
-        model_ns: 0,
-    }
+    Decision { at_ns, cause: Cause::Tick, triggers: vec![trigger], ..Decision::default() }
 }

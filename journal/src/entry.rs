@@ -8,7 +8,7 @@ use gleaner_base::text::{excerpt, hex};
 use gleaner_lambda::{Fault, Trigger};
 
 /// One wake: its inputs and its decision.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct JournalEntry {
     /// Stamp of the sample or tick, in ns.
     pub at_ns: i64,
@@ -41,6 +41,12 @@ pub enum WakeSource {
         /// Number of ticks without a wake since the previous wake.
         missed: u64,
     },
+}
+
+impl Default for WakeSource {
+    fn default() -> Self {
+        Self::Tick { missed: 0 }
+    }
 }
 
 /// The state of one input in a wake, and the samples of it that the lambda read.

@@ -11,7 +11,7 @@ use gleaner_lambda::manifest::{LambdaKind, Limits};
 /// The origin of the decisions of a journal: its first block, as JSON.
 ///
 /// Newer writers may add keys; readers ignore unknown ones.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct JournalHeader {
     /// Version of Gleaner that wrote it.
     pub gleaner: String,

@@ -174,11 +174,8 @@ impl<R: Read> JournalReader<R> {
     }
 
     fn open_block(&mut self) -> Result<(), ReadStop> {
-        self.at = BlockLocation {
-            offset: self.source.offset,
-            block: self.source.blocks,
-            wake: self.wake,
-        };
+        let BlockSource { offset, blocks: block, .. } = self.source;
+        self.at = BlockLocation { offset, block, wake: self.wake };
         match self.source.block()? {
             NextBlock::Nothing => self.state = ReadState::Truncated { torn_bytes: 0 },
             NextBlock::Torn(torn_bytes) => self.state = ReadState::Truncated { torn_bytes },
@@ -297,12 +294,10 @@ impl<R: Read> BlockSource<R> {
     fn block(&mut self) -> Result<NextBlock, ReadStop> {
         let mut head = [0; HEAD_LEN];
         let filled = self.fill(&mut head)?;
-        if filled < HEAD_LEN {
-            return Ok(if filled == 0 {
-                NextBlock::Nothing
-            } else {
-                NextBlock::Torn(filled as u64)
-            });
+        match filled {
+            0 => return Ok(NextBlock::Nothing),
+            1..HEAD_LEN => return Ok(NextBlock::Torn(filled as u64)),
+            _ => {}
         }
         let Some(Head { kind, len, payload_crc }) = Head::from_bytes(&head, self.blocks) else {
             return self.zeros(&head);

@@ -60,7 +60,7 @@ impl<W: Write> JournalWriter<W> {
         bytes.extend_from_slice(&MAGIC);
         bytes.extend_from_slice(&VERSION.to_le_bytes());
         bytes.resize(PREAMBLE_LEN, 0);
-        writer.write_json(kind::HEADER, header, bytes)?;
+        writer.write_json(kind::HEADER, header, &bytes)?;
         Ok(writer)
     }
 
@@ -128,7 +128,7 @@ impl<W: Write> JournalWriter<W> {
     pub fn finish(mut self, end: &JournalEnd) -> io::Result<W> {
         self.usable()?;
         self.write_wakes()?;
-        self.write_json(kind::END, end, Vec::new())?;
+        self.write_json(kind::END, end, &[])?;
         self.out.flush()?;
         Ok(self.out)
     }
@@ -186,19 +186,13 @@ impl<W: Write> JournalWriter<W> {
         self.finish_block(written)
     }
 
-    /// Writes `value` as a block of its own, after `bytes`, in one call.
-    fn write_json(
-        &mut self,
-        kind: u8,
-        value: &impl Serialize,
-        mut bytes: Vec<u8>,
-    ) -> io::Result<()> {
+    /// Writes `value` as a block of its own, after `before`, in one call.
+    fn write_json(&mut self, kind: u8, value: &impl Serialize, before: &[u8]) -> io::Result<()> {
         let json = serde_json::to_vec(value)?;
         if json.len() > PAYLOAD_MAX {
             return Err(refused("the header or the end is too large for a block of a journal"));
         }
-        bytes.extend_from_slice(&self.head(kind, &json));
-        bytes.extend_from_slice(&json);
+        let bytes = [before, &self.head(kind, &json), &json[..]].concat();
         let written = self.out.write_all(&bytes);
         self.finish_block(written)
     }

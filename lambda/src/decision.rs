@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 /// The order of the fields is the order of the keys in the file. JSON has no infinities and no NaN,
 /// and would carry `null` in their place; so the host refuses a trigger with such a score or
 /// attribute, as a fault of the lambda.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Decision {
     /// Log time of the sample or tick that woke the lambda, in ns since the epoch of the drive.
     pub at_ns: i64,
@@ -41,10 +41,11 @@ fn is_zero(count: &u64) -> bool {
 }
 
 /// The cause of a wake.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Cause {
     /// A sample on the input that `schedule.event` names.
+    #[default]
     Event,
     /// The clock, by `schedule.period`.
     Tick,

@@ -202,18 +202,11 @@ impl LineWriter {
     fn open(path: PathBuf, append: bool) -> Result<Self, OutputError> {
         let begun =
             if append { cut_partial_line(&path) } else { safe_file::create(&path).map(drop) };
-        let opened = begun.and_then(|()| safe_file::append(&path));
-        match opened {
-            Ok(file) => Ok(Self {
-                path,
-                file,
-                pending: Vec::new(),
-                pending_lines: 0,
-                lost: 0,
-                rotation: None,
-            }),
-            Err(source) => Err(OutputError { path, source }),
-        }
+        let file = match begun.and_then(|()| safe_file::append(&path)) {
+            Ok(file) => file,
+            Err(source) => return Err(OutputError { path, source }),
+        };
+        Ok(Self { path, file, pending: Vec::new(), pending_lines: 0, lost: 0, rotation: None })
     }
 
     fn write(&mut self, line: &impl Serialize) -> Result<(), OutputError> {

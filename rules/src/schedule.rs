@@ -62,7 +62,7 @@ pub struct EventSchedule<R> {
 }
 
 /// Wakes on a period, counted from the start of the drive, or of a live run.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct PeriodicSchedule {
     period_ns: i64,
     /// Set if live: then a tick is missed if its successor is due as well.
@@ -82,13 +82,7 @@ impl<R: RingView> Schedule<R> {
     /// first call of [`Schedule::next_tick`].
     pub fn periodic(period_ns: i64) -> Self {
         let period_ns = period_ns.max(1);
-        Self::Periodic(PeriodicSchedule {
-            period_ns,
-            live: false,
-            due_ns: None,
-            missed: 0,
-            missed_total: 0,
-        })
+        Self::Periodic(PeriodicSchedule { period_ns, ..PeriodicSchedule::default() })
     }
 
     /// Sets the start time of a replay: the first tick is due a period later.

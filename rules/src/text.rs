@@ -13,6 +13,15 @@ pub fn quoted<S: AsRef<str>>(names: impl IntoIterator<Item = S>) -> String {
     if listed.is_empty() { "none".to_owned() } else { listed.join(", ") }
 }
 
+/// Cuts `name` for a message: a hostile one must not fill the log.
+pub fn shortened(name: &str) -> String {
+    const LONGEST: usize = 40;
+    match name.char_indices().nth(LONGEST) {
+        None => name.to_owned(),
+        Some((end, _)) => format!("{}…", &name[..end]),
+    }
+}
+
 /// Escapes the control characters of `text`, so that none acts on a terminal.
 pub fn visible(text: &str) -> String {
     let mut shown = String::with_capacity(text.len());

@@ -15,7 +15,7 @@ const FILE: &str = "guest-sdk-rust/src/bindings.rs";
 /// The beginning of the file.
 const HEADER: &str = "\
 //! Bindings to the host for a component. Only this crate uses them; natively
-//! `testing::bindings` replaces them.
+//! `testing::bindings` replaces all but their data types.
 //!
 //! `cargo xtask bless` makes this file of `wit/` with wit-bindgen.
 ";

@@ -241,16 +241,13 @@ pub const SHARED_TYPES: &[&str] = &[
     "CallResult",
     "Column",
     "ConfigValue",
-    "Counts",
     "Field",
     "Frame",
     "Model",
     "Result",
     "Sample",
-    "ScratchError",
     "Tensor",
     "Topic",
-    "TriggerError",
 ];
 
 /// The names of all types that a Rust file defines; associated types do not count.

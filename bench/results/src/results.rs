@@ -16,7 +16,7 @@ use crate::statistics::Summary;
 const FORMAT: u32 = 1;
 
 /// The measurements of one run of a benchmark.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct BenchResults {
     format: u32,
     /// The benchmark, as in `cargo xtask bench NAME`.
@@ -78,17 +78,7 @@ impl BenchResults {
     pub fn new(bench: &str, is_quick: bool) -> Self {
         let mut machine = Machine::of_this();
         machine.add_load("load before");
-        Self {
-            format: FORMAT,
-            bench: bench.to_owned(),
-            is_quick,
-            machine,
-            figures: Vec::new(),
-            groups: Vec::new(),
-            growths: Vec::new(),
-            notes: Vec::new(),
-            recommendation: Vec::new(),
-        }
+        Self { format: FORMAT, bench: bench.to_owned(), is_quick, machine, ..Self::default() }
     }
 
     /// Returns whether all goals are met. They do not count in a quick run.

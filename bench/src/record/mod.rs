@@ -9,7 +9,7 @@ mod inline;
 mod process;
 
 use gleaner_bench_results::{Figure, quantile};
-use gleaner_journal::{InputView, JournalEntry, JournalHeader, LogDigest, WakeSource};
+use gleaner_journal::{JournalEntry, JournalHeader};
 use gleaner_lambda::manifest::Store;
 use gleaner_lambda::{Trigger, TriggerKind};
 use gleaner_transport::{Guid, SampleMeta};
@@ -139,18 +139,8 @@ fn header() -> JournalHeader {
         machine: std::env::consts::ARCH.to_owned(),
         lambda: "load".to_owned(),
         version: "0.1.0".to_owned(),
-        kind: gleaner_lambda::manifest::LambdaKind::Wasm,
-        files: Vec::new(),
-        models: Vec::new(),
-        manifest: String::new(),
-        inputs: Vec::new(),
-        event_input: None,
-        config: serde_json::Map::new(),
-        remaps: Vec::new(),
         clock: "monotonic".to_owned(),
-        part: Default::default(),
-        wakes_before: 0,
-        limits: Default::default(),
+        ..JournalHeader::default()
     }
 }
 
@@ -163,11 +153,8 @@ fn wake(at_ns: i64, triggers: bool) -> JournalEntry {
     };
     JournalEntry {
         at_ns,
-        cause: WakeSource::Tick { missed: 0 },
-        seen: Vec::<InputView>::new(),
         triggers: if triggers { vec![trigger] } else { Vec::new() },
-        fault: None,
         fuel: Some(1000),
-        log: LogDigest::default(),
+        ..JournalEntry::default()
     }
 }

@@ -141,8 +141,6 @@ fn cost_change(Cost { what, unit, a, b, ratio }: &Cost) -> String {
 
 #[cfg(test)]
 mod tests {
-    use gleaner_lambda::manifest::LambdaKind;
-
     use super::*;
 
     fn side(out: &str) -> ComparedRun {
@@ -151,26 +149,14 @@ mod tests {
             out,
             lambda,
             version,
-            kind: LambdaKind::Wasm,
             drive: vec!["a.mcap".to_owned()],
             start_ns: Some(0),
+            ..ComparedRun::default()
         }
     }
 
     fn empty_diff() -> Diff {
-        Diff {
-            identical: true,
-            a: side("a"),
-            b: side("b"),
-            notes: Vec::new(),
-            config: Vec::new(),
-            counts: Vec::new(),
-            cost: Vec::new(),
-            triggers: ChangeCounts::default(),
-            faults: ChangeCounts::default(),
-            differences: Vec::new(),
-            omitted: 0,
-        }
+        Diff { identical: true, a: side("a"), b: side("b"), ..Diff::default() }
     }
 
     fn difference(change: ChangeKind, t: f64, label: &str) -> Difference {

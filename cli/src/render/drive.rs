@@ -181,8 +181,6 @@ mod tests {
             messages: Some(12_345),
             is_defined: true,
             layouts: 1,
-            malformed: 0,
-            unreadable: None,
             messages_read: 12_345,
             interval: Some(DurationStats {
                 n: 12_344,
@@ -194,21 +192,13 @@ mod tests {
             missing: Some(0),
             largest_bytes: 324,
             bytes: 324 * 12_345,
-            picture: None,
+            ..DriveTopicInfo::default()
         }
     }
 
     fn seen(topics: Vec<DriveTopicInfo>) -> DriveInfo {
         let [start_ns, end_ns] = [1_500_000_000_250_000_000, 1_500_000_002_000_000_000].map(Some);
-        DriveInfo {
-            start_ns,
-            end_ns,
-            parts: Vec::new(),
-            out_of_order: 0,
-            damaged: None,
-            topics,
-            skipped: 0,
-        }
+        DriveInfo { start_ns, end_ns, topics, ..DriveInfo::default() }
     }
 
     #[test]

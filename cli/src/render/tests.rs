@@ -1,6 +1,5 @@
 use gleaner_journal::TimeRange;
-use gleaner_lambda::manifest::LambdaKind;
-use gleaner_lambda::{Cause, Recovered, TriggerKind};
+use gleaner_lambda::{Recovered, TriggerKind};
 
 use super::*;
 
@@ -11,23 +10,12 @@ fn replay() -> ReplaySummary {
     ReplaySummary {
         lambda: "brake-dark".to_owned(),
         version: "0.1.0".to_owned(),
-        kind: LambdaKind::Wasm,
         drive: vec!["a.mcap".into()],
         out: "out/demo".into(),
         wakes: 1200,
         triggers: 1,
-        faults: 0,
-        skipped: 0,
-        missed_ticks: 0,
-        out_of_order: 0,
-        malformed: Default::default(),
-        log_lines: 0,
-        log_dropped: 0,
-        triggers_refused: 0,
-        backed_off: 0,
         start_ns: START_NS,
         end_ns: START_NS + 40_000_000_000,
-        part: TimeRange::default(),
         wall_s: 0.5,
         run_s: 0.4,
         decode_s: 0.1,
@@ -39,15 +27,10 @@ fn replay() -> ReplaySummary {
             topic: "/imu/data".to_owned(),
             type_name: "sensor_msgs/msg/Imu".to_owned(),
             received: 1200,
-            lost: None,
             overwritten: 700,
-            no_slot: 0,
-            too_big: 0,
+            ..TopicReport::default()
         }],
-        recording: RecordingCounts::default(),
-        clips_replaced: 0,
-        damaged: None,
-        stopped: None,
+        ..ReplaySummary::default()
     }
 }
 
@@ -60,11 +43,6 @@ fn decision(milliseconds: i64, label: Option<&str>, fault: Option<(FaultKind, &s
     };
     Decision {
         at_ns: START_NS + milliseconds * 1_000_000,
-        cause: Cause::Event,
-        input: None,
-        topic: None,
-        writer: None,
-        seq: None,
         triggers: label.map(trigger).into_iter().collect(),
         fault: fault.map(|(kind, message)| Fault {
             kind,
@@ -72,9 +50,7 @@ fn decision(milliseconds: i64, label: Option<&str>, fault: Option<(FaultKind, &s
             used: None,
             allowed: None,
         }),
-        fuel: None,
-        run_ns: 0,
-        model_ns: 0,
+        ..Decision::default()
     }
 }
 

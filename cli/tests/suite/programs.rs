@@ -6,6 +6,9 @@ use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
 use std::sync::{Mutex, PoisonError};
 
+use gleaner_trust::{Labels, RootKeys, ScopedKey, TrustRoot};
+use serde_json::Value;
+
 /// Linux refuses to start a file that is open for writing anywhere, such as in a child that another
 /// test is about to start. The lock serialises writing and starting programs.
 static EXEC_LOCK: Mutex<()> = Mutex::new(());
@@ -34,4 +37,20 @@ pub fn done(command: &mut Command) -> String {
     let Output { status, stdout, stderr } = output(command);
     assert!(status.success(), "{}", String::from_utf8_lossy(&stderr));
     String::from_utf8(stdout).unwrap()
+}
+
+/// Returns a root that trusts a key, as `gleaner keys show --json` prints it, for all lambdas.
+pub fn trusting(shown: &str) -> TrustRoot {
+    let shown: Value = serde_json::from_str(shown).unwrap();
+    let key = shown["public"].as_str().unwrap().parse().unwrap();
+    let lambdas = vec!["*".parse().unwrap()];
+    let scoped = vec![ScopedKey { key, lambdas, labels: Labels::new() }];
+    TrustRoot {
+        version: 1,
+        created: 0,
+        expires: 1,
+        root: RootKeys { threshold: 1, keys: vec![scoped[0].key.clone()] },
+        publishers: scoped.clone(),
+        deployers: scoped,
+    }
 }

@@ -5,7 +5,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::PathBuf;
 use std::process::{Command, Output, Stdio};
 
-use gleaner_trust::{Floors, Labels, Revision, RootKeys, ScopedKey, TrustRoot, Verifier};
+use gleaner_trust::{Floors, Labels, Revision, Verifier};
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -59,21 +59,7 @@ impl Workplace {
 
     /// Returns the revision as a vehicle reads it that trusts the key.
     fn verified(&self) -> Revision {
-        let shown = self.done(&["keys", "show", "key.pem", "--json"]);
-        let shown: Value = serde_json::from_str(&shown).unwrap();
-        let key = ScopedKey {
-            key: shown["public"].as_str().unwrap().parse().unwrap(),
-            lambdas: vec!["*".parse().unwrap()],
-            labels: Labels::new(),
-        };
-        let root = TrustRoot {
-            version: 1,
-            created: 0,
-            expires: 1,
-            root: RootKeys { threshold: 1, keys: vec![key.key.clone()] },
-            publishers: vec![key],
-            deployers: Vec::new(),
-        };
+        let root = programs::trusting(&self.done(&["keys", "show", "key.pem", "--json"]));
         let (floors, labels) = (Floors::default(), Labels::new());
         let vehicle = Verifier { root: &root, floors: &floors, labels: &labels, now: 0 };
         let envelope = fs::read(self.path("brake/revision.json")).unwrap();

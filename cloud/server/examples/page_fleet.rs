@@ -224,16 +224,11 @@ async fn deployment(
         attempt: 1,
         lambda: wanted.id.clone(),
         revision: RevisionStatus { digest: digest.clone(), version: "1.0.0".into(), release: 1 },
-        fallback: None,
-        grants: Default::default(),
         is_wanted: wanted.is_wanted,
-        runs_fallback: false,
         is_proven: true,
-        failed: None,
         refused: is_refused.then(|| HOSTILE.to_owned()),
-        stale: None,
-        demand: Vec::new(),
         status: (wanted.is_wanted && !is_refused).then(|| lambda(&wanted.id, digest)),
+        ..DeploymentStatus::default()
     })
 }
 
@@ -253,14 +248,8 @@ fn lambda(id: &str, revision: String) -> LambdaStatus {
         rate_hz: 100.0,
         received: 730_000,
         lost: Some(2),
-        malformed: 0,
-        overwritten: 0,
-        no_slot: 0,
-        too_big: 0,
-        skipped: 0,
         age_ns: Some(4_100_000),
-        qos: None,
-        qos_warnings: Vec::new(),
+        ..LiveTopic::default()
     }];
     LambdaStatus {
         id: id.to_owned(),
@@ -270,15 +259,13 @@ fn lambda(id: &str, revision: String) -> LambdaStatus {
         phase: LambdaPhase::Running,
         phase_s: 7290.0,
         pid: Some(7),
-        restarts: 0,
-        last_end: None,
         live: Some(Box::new(live)),
-        recent: Default::default(),
         layers: vec![
             Layer::yes("files", "landlock: only the build folder"),
             Layer::yes("processes", "own namespace"),
             Layer::partly("memory", "no control group: the address space is limited"),
             Layer::no("devices", "the kernel has no filter"),
         ],
+        ..LambdaStatus::default()
     }
 }

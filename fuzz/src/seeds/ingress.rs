@@ -109,8 +109,7 @@ fn grant(id: u32) -> TopicGrant {
         depth: 20,
         holds: HoldGrant { windows: 1, window: 20, singles: 3 },
         wakes: true,
-        digests: false,
-        shown: false,
+        ..TopicGrant::default()
     }
 }
 
@@ -119,14 +118,8 @@ fn attached() -> AttachedTopic {
         id: 1,
         type_name: "sensor_msgs/msg/Imu".to_owned(),
         layout: RegionLayout { depth: 20, slots: 50, slot_bytes: 4096 },
-        first_word: 0,
         holds: HoldGrant { windows: 1, window: 20, singles: 3 },
         first: 9,
-        digests: 0,
-        refused: 0,
-        definitions: None,
-        type_hash: None,
-        is_recorded: false,
-        offered_qos: None,
+        ..AttachedTopic::default()
     }
 }

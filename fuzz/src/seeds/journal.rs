@@ -4,7 +4,6 @@ use gleaner_journal::{
     Encoder, InputView, JournalEnd, JournalEntry, JournalHeader, JournalInput, JournalWriter,
     LogDigest, WakeSource,
 };
-use gleaner_lambda::manifest::LambdaKind;
 use gleaner_lambda::{Fault, FaultKind, Trigger, TriggerKind};
 use serde_json::{Map, json};
 
@@ -92,18 +91,11 @@ pub(super) fn header() -> JournalHeader {
         machine: "x".to_owned(),
         lambda: "brake".to_owned(),
         version: "0.1.0".to_owned(),
-        kind: LambdaKind::Wasm,
-        files: Vec::new(),
-        models: Vec::new(),
-        manifest: String::new(),
         inputs: vec![input("camera"), input("imu")],
         event_input: Some(0),
-        config: Map::new(),
         remaps: vec![("/imu".to_owned(), "/car/imu".to_owned())],
         clock: "x".to_owned(),
-        part: Default::default(),
-        wakes_before: 0,
-        limits: Default::default(),
+        ..JournalHeader::default()
     }
 }
 
@@ -118,10 +110,8 @@ pub(super) fn entries() -> Vec<JournalEntry> {
         at_ns: 1_500_000_000_000_000_000 + 100_000_000 * seq as i64,
         cause: WakeSource::Sample { writer: [7; 16], seq },
         seen: vec![seen(seq), seen(10 * seq)],
-        triggers: Vec::new(),
-        fault: None,
         fuel: Some(250_000 + seq),
-        log: LogDigest::default(),
+        ..JournalEntry::default()
     };
     let mut attributes = Map::new();
     attributes.insert("speed".to_owned(), json!([1.5, -0.0, null, "text", { "a": 1e300 }]));

@@ -4,6 +4,7 @@ use gleaner_journal::Encoder;
 use gleaner_lambda::manifest::Limits;
 use gleaner_protocol::link::AddLambda;
 
+pub use super::journal::WORDS;
 use super::journal::{entries, header};
 use crate::link::mode;
 

@@ -1,12 +1,13 @@
 //! Native replacement of the bindings that wit-bindgen generates for a component: the same names,
-//! over the fake host in this folder.
+//! over the fake host in this folder. The data types are those that it generates.
 //!
 //! The SDK is written against both, so a name that is missing in one of them fails a build.
 
 /// The interfaces, in the modules in which wit-bindgen puts them.
 pub(crate) mod gleaner {
     pub(crate) mod lambda {
-        pub(crate) use crate::testing::{data, inference, log, scratch, trigger, types};
+        pub(crate) use crate::generated::gleaner::lambda::types;
+        pub(crate) use crate::testing::{data, inference, log, scratch, trigger};
     }
 }
 

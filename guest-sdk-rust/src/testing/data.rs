@@ -14,9 +14,16 @@ use super::message::{ENCAPSULATION, Message};
 use super::path::{FieldPath, FieldRef, MissingField, known};
 use super::ring::{Cell, Ring};
 use super::session::{Handle, HandleCounter, current};
-use super::types::{Column, Counts, DataError, Identity, Stamps, Value};
+use crate::data::{Counts, DataError, Identity, Stamps, Value};
+use crate::generated::gleaner::lambda::types::Column;
 
 type CallResult<T> = Result<T, DataError>;
+
+impl From<WrongField> for DataError {
+    fn from(wrong: WrongField) -> Self {
+        Self::WrongField(wrong.to_string())
+    }
+}
 
 /// Cause of a wake.
 pub enum Wake {

@@ -12,8 +12,9 @@ use super::manifest::Input;
 use super::message::ImageData;
 use super::ring::Cell;
 use super::session::Handle;
-use super::types::{DataError, Encoding, FrameInfo, Identity, Roi, Stamps, Value};
-use crate::data::{bytes_per_pixel, encoding_name};
+use crate::data::{
+    DataError, Encoding, FrameInfo, Identity, Roi, Stamps, Value, bytes_per_pixel, encoding_name,
+};
 
 type CallResult<T> = Result<T, DataError>;
 

@@ -11,90 +11,16 @@ use super::data::Frame;
 use super::manifest::Limits;
 use super::model::{FakeModel, SeenFrame};
 use super::session::{Handle, HandleCounter, current};
-use super::types::{Encoding, Preprocess, refusal};
-use crate::data::encoding_name;
+use crate::data::{Encoding, encoding_name};
+pub use crate::generated::gleaner::lambda::inference::{
+    DetectOptions, Detection, ElementType, InferenceError, TensorInfo,
+};
+use crate::inference::Preprocess;
 
 const MAX_DIMENSIONS: usize = 8;
 /// Maximum side of a tensor that is created from a frame.
 const MAX_SIDE: u32 = 8192;
 const MAX_DETECTIONS: u32 = 1024;
-
-/// Reason why a tensor cannot be created, or a model cannot be opened or run. Each message names
-/// the object, the cause and the way out.
-#[derive(Clone, Debug)]
-pub enum InferenceError {
-    /// The process that runs models has ended or is not ready; a later call may succeed.
-    Unavailable(String),
-    /// The manifest has no `[[model]]` of that name.
-    NoSuchModel(String),
-    /// Name, shape or type of a tensor does not fit the model, or a value is out of range.
-    WrongInput(String),
-    /// The models of this wake took longer than `model_time` in `[limits]`.
-    TooSlow(String),
-    /// The model cannot be loaded, or its run failed.
-    Failed(String),
-}
-
-refusal!(InferenceError);
-
-/// Type of the elements of a tensor.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
-#[allow(missing_docs)]
-pub enum ElementType {
-    Float32,
-    Float16,
-    Float64,
-    Int8,
-    Int16,
-    Int32,
-    Int64,
-    Uint8,
-    Boolean,
-}
-
-/// An input or output of a model.
-#[derive(Clone, Debug)]
-pub struct TensorInfo {
-    /// Its name in the model.
-    pub name: String,
-    /// Type of its elements.
-    pub element: ElementType,
-    /// Length of each dimension; `None` for one that may have any length.
-    pub shape: Vec<Option<u32>>,
-}
-
-/// An object that `detect` found; its box is in pixels of the frame.
-#[derive(Clone, Debug)]
-pub struct Detection {
-    /// Class index of the model.
-    pub class: u32,
-    /// Name of the class from `labels` in the manifest; without labels, the index as text.
-    pub label: String,
-    /// Confidence, 0 to 1.
-    pub score: f32,
-    /// Left edge.
-    pub x: f32,
-    /// Upper edge.
-    pub y: f32,
-    /// Width, above 0.
-    pub width: f32,
-    /// Height, above 0.
-    pub height: f32,
-}
-
-/// Options of `detect`.
-#[derive(Clone, Debug)]
-pub struct DetectOptions {
-    /// Classes to return, by name or by index as text; empty for all.
-    pub classes: Vec<String>,
-    /// Minimum score, 0 to 1; detections with a lower one are dropped.
-    pub min_score: f32,
-    /// Overlap (intersection over union), 0 to 1, above which the detection with the lower score is
-    /// dropped.
-    pub max_iou: f32,
-    /// Maximum number of detections, highest score first; clamped to 1,024.
-    pub max_count: u32,
-}
 
 type CallResult<T> = Result<T, InferenceError>;
 

@@ -4,8 +4,7 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::sync::Arc;
 
-use super::types::{Encoding, Value};
-use crate::data::{bytes_per_pixel, encoding_name};
+use crate::data::{Encoding, Value, bytes_per_pixel, encoding_name};
 
 /// One message of a test.
 ///

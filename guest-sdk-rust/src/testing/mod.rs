@@ -80,7 +80,6 @@ pub(crate) mod scratch;
 mod session;
 mod table;
 pub(crate) mod trigger;
-pub(crate) mod types;
 
 pub use decision::{AttributeValue, Cause, Decision, Fault, FaultKind, Trigger, TriggerKind};
 pub use error::Error;

@@ -6,7 +6,7 @@ use gleaner_rules::path::{MalformedPath, PathSegment, segments};
 use gleaner_rules::text::quoted;
 
 use super::error::nearest;
-use super::types::Value;
+use crate::data::Value;
 
 /// A path with valid syntax. Only a message shows whether the field exists.
 pub(super) struct FieldPath {

@@ -3,7 +3,7 @@
 use gleaner_rules::ring as rules;
 
 use super::message::Message;
-use super::types::Guid;
+use crate::data::Guid;
 
 pub(super) type Ring = rules::Ring<Arrival>;
 pub(super) type Cell = rules::Cell<Arrival>;

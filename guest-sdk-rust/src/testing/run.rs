@@ -15,8 +15,7 @@ use super::path::known;
 use super::ring::{Arrival, Cell};
 use super::schedule::Schedule;
 use super::session::{Session, attempt};
-use super::types::{Counts, Encoding, Guid, Value};
-use crate::data::Sample;
+use crate::data::{Counts, Encoding, Guid, Sample, Value};
 use crate::{Config, Lambda};
 
 /// A loaded lambda with its decisions, log and counts so far.

@@ -5,21 +5,7 @@ pub use gleaner_rules::scratch::Entry;
 use gleaner_rules::scratch::ScratchError as Refused;
 
 use super::session::current;
-use super::types::refusal;
-
-/// Reason why a call was refused. The call had no effect. Each message names the entry, the cause
-/// and the way out.
-#[derive(Clone, Debug)]
-pub enum ScratchError {
-    /// The entries would exceed `scratch` in `[limits]`, or there are 1,024 entries already.
-    NoRoom(String),
-    /// There is no entry of that name.
-    NoSuchEntry(String),
-    /// The name is not 1 to 128 bytes long, or has control characters.
-    WrongName(String),
-}
-
-refusal!(ScratchError);
+pub use crate::generated::gleaner::lambda::scratch::ScratchError;
 
 type CallResult<T> = Result<T, ScratchError>;
 

@@ -6,20 +6,7 @@ use gleaner_rules::triggers::{TriggerError as Refused, TriggerKind};
 
 use super::decision::Trigger;
 use super::session::current;
-use super::types::refusal;
-
-/// Reason why a call was refused. The call had no effect. The message names the limit.
-#[derive(Clone, Debug)]
-pub enum TriggerError {
-    /// Called outside of a wake; label empty or over 128 bytes; score or value not finite; key
-    /// empty, over 64 bytes or given twice; text over 1,024 bytes; more than 16 attributes.
-    Invalid(String),
-    /// More than 16 triggers in one wake, or more in a minute than `events_per_minute` in
-    /// `[limits]`, which does not apply to `stop`.
-    TooMany(String),
-}
-
-refusal!(TriggerError);
+pub use crate::generated::gleaner::lambda::trigger::TriggerError;
 
 type CallResult = Result<(), TriggerError>;
 

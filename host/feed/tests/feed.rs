@@ -51,13 +51,7 @@ fn info(id: u32, first_word: u32) -> AttachedTopic {
         layout: RegionLayout { depth, slots, slot_bytes },
         first_word,
         holds: HOLDS,
-        first: 0,
-        digests: 0,
-        refused: 0,
-        definitions: None,
-        type_hash: None,
-        is_recorded: false,
-        offered_qos: None,
+        ..AttachedTopic::default()
     }
 }
 

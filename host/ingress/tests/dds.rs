@@ -44,8 +44,7 @@ fn grant(id: u32, topic: &str, max_bytes: u64) -> TopicGrant {
         depth: 8192,
         holds: HoldGrant { windows: 1, window: 8, singles: 4 },
         wakes: true,
-        digests: false,
-        shown: false,
+        ..TopicGrant::default()
     }
 }
 

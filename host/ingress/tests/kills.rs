@@ -18,7 +18,7 @@ use gleaner_buffers::shared::ControlMemory;
 use gleaner_feed::Feed;
 use gleaner_ingress::Ingress;
 use gleaner_protocol::ingress::{
-    AddReader, HoldGrant, IngressControl, IngressLink, PublishGrant, Qos, TopicGrant,
+    AddReader, HoldGrant, IngressControl, IngressLink, PublishGrant, TopicGrant,
 };
 use gleaner_protocol::link::Incoming;
 use gleaner_regions::ControlRegion;
@@ -63,17 +63,15 @@ struct ReaderProcess {
 impl ReaderProcess {
     fn start(control: &mut IngressControl, role: &str) -> Self {
         let grant = TopicGrant {
-            id: 0,
             topic: "/words".to_owned(),
             type_name: Some(TYPE.to_owned()),
-            qos: Qos::Auto,
             queue: 8,
             max_bytes: Some(8 * WORDS as u64),
             depth: 64,
             holds: HoldGrant { windows: 2, window: 16, singles: 8 },
             wakes: true,
             digests: role == "verify",
-            shown: false,
+            ..TopicGrant::default()
         };
         let (topic, type_name) = ("/published".to_owned(), TYPE.to_owned());
         let publishes = vec![PublishGrant { topic, type_name, depth: 4, max_bytes: 1024 }];

@@ -30,13 +30,8 @@ impl EntryBuilder {
         let topics: Vec<_> =
             inputs.iter().map(|topic| (Arc::clone(topic), Trace::of(topic))).collect();
         let entry = JournalEntry {
-            at_ns: 0,
-            cause: WakeSource::Tick { missed: 0 },
             seen: vec![InputView::default(); topics.len()],
-            triggers: Vec::new(),
-            fault: None,
-            fuel: None,
-            log: LogDigest::default(),
+            ..JournalEntry::default()
         };
         Self { topics, woken_by: None, entry }
     }

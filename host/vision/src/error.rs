@@ -167,15 +167,6 @@ fn way_out(encoding: Encoding) -> &'static str {
     }
 }
 
-/// Cuts `name` for a message.
-pub(crate) fn shortened(name: &str) -> String {
-    const LONGEST: usize = 40;
-    match name.char_indices().nth(LONGEST) {
-        None => name.to_owned(),
-        Some((end, _)) => format!("{}…", &name[..end]),
-    }
-}
-
 /// Formats a shape, such as `[1, 84, ?]`.
 pub(crate) fn shape_text(shape: impl IntoIterator<Item = Option<u32>>) -> String {
     let text_of = |length: Option<u32>| length.map_or("?".to_owned(), |it| it.to_string());

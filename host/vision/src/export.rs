@@ -1,5 +1,7 @@
 //! Statements of an export about its model, in the metadata of the file.
 
+use gleaner_rules::text::shortened;
+
 /// The metadata of a model, as Ultralytics writes it; other exports have none.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct ExportNote {
@@ -38,7 +40,7 @@ impl ExportNote {
             return Some("RT-DETR".to_owned());
         }
         let task = self.task.as_deref().filter(|task| *task != "detect")?;
-        Some(format!("for task `{}`", crate::error::shortened(task)))
+        Some(format!("for task `{}`", shortened(task)))
     }
 
     /// Returns the first label that is the name of another class, with its index and that class.

@@ -1,6 +1,8 @@
 //! Families of detectors: the form of their input and of their output.
 
-use crate::error::{VisionError, shape_text, shortened};
+use gleaner_rules::text::shortened;
+
+use crate::error::{VisionError, shape_text};
 use crate::export::ExportNote;
 use crate::placement::Placement;
 use crate::prepare::Preprocess;

@@ -5,7 +5,6 @@ use serde_json::{Map, json};
 use super::block::{HEAD_LEN, Head, MAGIC, PREAMBLE_LEN, kind};
 use super::*;
 use gleaner_base::{Exit, Explain};
-use gleaner_lambda::manifest::LambdaKind;
 use gleaner_lambda::{Fault, Trigger, TriggerKind};
 
 mod differences;
@@ -51,10 +50,8 @@ fn header(inputs: usize) -> JournalHeader {
         machine: "x86_64".to_owned(),
         lambda: "brake-dark".to_owned(),
         version: "0.1.0".to_owned(),
-        kind: LambdaKind::Wasm,
         files: vec![file("brake_dark.wasm"), file("lambda.toml")],
         models: vec![file("models/d.onnx")],
-        manifest: String::new(),
         inputs: (0..inputs)
             .map(|n| JournalInput {
                 name: format!("in{n}"),
@@ -70,9 +67,7 @@ fn header(inputs: usize) -> JournalHeader {
         ]),
         remaps: vec![("/in0".to_owned(), "/wire0".to_owned())],
         clock: "log time of the drive".to_owned(),
-        part: Default::default(),
-        wakes_before: 0,
-        limits: Default::default(),
+        ..JournalHeader::default()
     }
 }
 
@@ -162,10 +157,8 @@ fn usual_entries(inputs: usize, n: usize) -> Vec<JournalEntry> {
                 at_ns: 1_533_199_000_000_000_000 + index as i64 * step_ns + jitter_ns,
                 cause: WakeSource::Sample { writer: [7; 16], seq },
                 seen,
-                triggers: Vec::new(),
-                fault: None,
                 fuel: Some(250_000 + random.below(20_000)),
-                log: LogDigest::default(),
+                ..JournalEntry::default()
             }
         })
         .collect()

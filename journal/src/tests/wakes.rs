@@ -57,12 +57,8 @@ fn a_usual_wake_takes_few_bytes() {
 fn a_tick_without_new_samples_takes_two_bytes_and_one_for_each_input() {
     let tick = |at_ns| JournalEntry {
         at_ns,
-        cause: WakeSource::Tick { missed: 0 },
         seen: vec![InputView { newest: Some(([1; 16], 5)), ..InputView::default() }; 3],
-        triggers: Vec::new(),
-        fault: None,
-        fuel: None,
-        log: LogDigest::default(),
+        ..JournalEntry::default()
     };
     let (mut encoder, mut bytes) = (Encoder::new(3), Vec::new());
     for n in 0..2 {
@@ -126,10 +122,9 @@ fn numbers_at_the_ends_of_their_range_do_not_overflow() {
             newest: Some(([0; 16], number)),
             reach: number,
         }],
-        triggers: Vec::new(),
-        fault: None,
         fuel: Some(number),
         log: LogDigest { lines: u32::MAX, digest: 0 },
+        ..JournalEntry::default()
     };
     let ends =
         [(i64::MIN, 0), (i64::MAX, u64::MAX), (i64::MIN, u64::MAX), (i64::MAX, 1), (-1, 1 << 63)];

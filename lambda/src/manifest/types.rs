@@ -60,10 +60,11 @@ pub struct LambdaSection {
 }
 
 /// The kinds of lambda.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum LambdaKind {
     /// A WebAssembly component.
+    #[default]
     Wasm,
     /// A Python file.
     Python,

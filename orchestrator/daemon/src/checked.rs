@@ -134,10 +134,8 @@ impl SignedDeployment {
             runs_fallback: deployed.runs_fallback,
             is_proven: deployed.is_proven,
             failed: deployed.failed.clone(),
-            refused: None,
             stale: stale.map(|refusal| refusal.to_string()),
-            demand: Vec::new(),
-            status: None,
+            ..DeploymentStatus::default()
         }
     }
 }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use gleaner_lambda::manifest::ItemName;
 use gleaner_protocol::supervision::SupervisorStatus;
-use gleaner_protocol::vehicle_api::{Capacity, DeploymentStatus, GrantStatus, RevisionStatus};
+use gleaner_protocol::vehicle_api::{Capacity, DeploymentStatus};
 
 use crate::core::Core;
 use crate::state::Deployed;
@@ -56,22 +56,16 @@ impl Core {
 
 /// Returns the status of a deployment whose envelope counts no more.
 fn refused(id: &ItemName, deployed: &Deployed, reason: &str) -> DeploymentStatus {
-    let revision = RevisionStatus { digest: String::new(), version: String::new(), release: 0 };
     DeploymentStatus {
         id: id.to_string(),
         release: deployed.release,
         attempt: deployed.attempt,
         lambda: deployed.lambda.to_string(),
-        revision,
-        fallback: None,
-        grants: GrantStatus::default(),
         is_wanted: deployed.is_wanted,
         runs_fallback: deployed.runs_fallback,
         is_proven: deployed.is_proven,
         failed: deployed.failed.clone(),
         refused: Some(reason.to_owned()),
-        stale: None,
-        demand: Vec::new(),
-        status: None,
+        ..DeploymentStatus::default()
     }
 }

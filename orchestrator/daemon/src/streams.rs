@@ -226,11 +226,9 @@ pub(crate) fn line(stream: &str, item: Result<SpoolItem, gleaner_spool::SpoolErr
     let line = |seq, kind: &str, record| StreamLine {
         stream: stream.to_owned(),
         seq,
-        time_ns: 0,
-        boot_ns: 0,
-        boot: String::new(),
         kind: kind.to_owned(),
         record,
+        ..StreamLine::default()
     };
     match item {
         Ok(SpoolItem::Record(record)) => {

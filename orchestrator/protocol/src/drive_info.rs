@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use crate::DurationStats;
 
 /// The content of a recorded drive.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct DriveInfo {
     /// Log time of its first message, in ns since the epoch; `None` if there is none.
     pub start_ns: Option<i64>,
@@ -26,7 +26,7 @@ pub struct DriveInfo {
 }
 
 /// A topic of a drive.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct DriveTopicInfo {
     /// Absolute name.
     pub topic: String,

@@ -16,7 +16,7 @@ pub const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(30);
 
 /// The end of a runtime. `gleaner-shim` writes it for the supervisor, even if the supervisor has
 /// ended before.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ExitRecord {
     /// Process id of the runtime.
     pub pid: u32,
@@ -276,7 +276,6 @@ mod tests {
             pid: 17,
             started_ns: 1,
             ended_ns: 2,
-            code: None,
             signal: Some(9),
             killed: Some(Killed {
                 phase: Phase::Wake,
@@ -285,12 +284,9 @@ mod tests {
                 at_ns: 5,
                 reason: KillReason::Overdue,
             }),
-            out_of_memory: false,
             max_rss_bytes: 1 << 20,
             cpu_ns: 3,
-            orphans: 0,
-            end_requested: false,
-            phase: None,
+            ..ExitRecord::default()
         }
     }
 

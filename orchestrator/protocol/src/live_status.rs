@@ -9,7 +9,7 @@ use gleaner_lambda::manifest::LambdaKind;
 
 /// The status of a live lambda. Counts are since its start; durations are since the previous
 /// report, and in the last report since the start.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct LiveStatus {
     /// Name of the lambda.
     pub lambda: String,
@@ -131,29 +131,7 @@ impl LiveStatus {
             version: version.to_owned(),
             kind,
             out,
-            restarts: 0,
-            up_s: 0.0,
-            wakes: 0,
-            triggers: 0,
-            faults: 0,
-            skipped: 0,
-            missed_ticks: 0,
-            log_lines: 0,
-            log_dropped: 0,
-            triggers_refused: 0,
-            backed_off: 0,
-            unwritten: 0,
-            unsent: 0,
-            wake_latency: None,
-            run_time: None,
-            decision_latency: None,
-            topics: Vec::new(),
-            network: NetworkStatus::default(),
-            reception_gaps: ReceptionGaps::default(),
-            recorder_link: None,
-            recording: None,
-            rss_bytes: 0,
-            cpu_s: 0.0,
+            ..LiveStatus::default()
         }
     }
 
@@ -231,7 +209,7 @@ pub struct DurationStats {
 }
 
 /// The samples of one input: received and lost.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct LiveTopic {
     /// Name of the input.
     pub name: String,
@@ -339,8 +317,7 @@ mod tests {
             too_big: count,
             skipped: count,
             age_ns: Some(5),
-            qos: None,
-            qos_warnings: Vec::new(),
+            ..LiveTopic::default()
         };
         LiveStatus {
             restarts: count as u32,

@@ -99,7 +99,7 @@ pub struct Round {
 }
 
 /// The summary of a replay.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct ReplaySummary {
     /// Name of the lambda.
     pub lambda: String,
@@ -173,7 +173,7 @@ pub struct ReplaySummary {
 }
 
 /// The samples of one input: received and lost.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct TopicReport {
     /// Name of the input.
     pub name: String,
@@ -226,42 +226,30 @@ mod tests {
             topic: "/imu/data".to_owned(),
             type_name: "sensor_msgs/msg/Imu".to_owned(),
             received: 50,
-            lost: None,
             overwritten: 1,
-            no_slot: 0,
-            too_big: 0,
+            ..TopicReport::default()
         };
         let summary = ReplaySummary {
             lambda: "brake-dark".to_owned(),
             version: "0.1.0".to_owned(),
-            kind: LambdaKind::Wasm,
             drive: vec!["a.mcap".into(), "b".into()],
             out: "out".into(),
             wakes: 50,
             triggers: 2,
-            faults: 0,
-            skipped: 0,
-            missed_ticks: 0,
             out_of_order: 4,
-            malformed: BTreeMap::new(),
             log_lines: 3,
-            log_dropped: 0,
             triggers_refused: 5,
             backed_off: 6,
             start_ns: 1,
             end_ns: 2,
-            part: TimeRange::default(),
             wall_s: 0.25,
             run_s: 0.125,
-            decode_s: 0.0,
             wakes_per_s: 200.0,
             peak_rss_bytes: 1 << 20,
-            models: Vec::new(),
             topics: vec![topic],
             recording: RecordingCounts { clips: 2, in_cooldown: 3, ..RecordingCounts::default() },
             clips_replaced: 1,
-            damaged: None,
-            stopped: None,
+            ..ReplaySummary::default()
         };
         // The counts of the recorder are at the top level.
         let counts = serde_json::to_string(&summary.recording).unwrap();

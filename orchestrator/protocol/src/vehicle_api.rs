@@ -94,7 +94,7 @@ pub struct TrustStatus {
 }
 
 /// The status of a deployment.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct DeploymentStatus {
     /// Its id.
@@ -152,7 +152,7 @@ pub struct Changed {
 }
 
 /// A revision of a deployment.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct RevisionStatus {
     /// Digest of the revision.
@@ -242,7 +242,7 @@ pub struct MissingObject {
 }
 
 /// A line of `GET /v1/events` and `GET /v1/lambdas/ID/records`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct StreamLine {
     /// Name of the stream.

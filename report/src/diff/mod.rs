@@ -29,7 +29,7 @@ const LISTED: usize = 1_000;
 const LISTED_OF_EACH: usize = 20;
 
 /// The differences between two runs.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Default, Serialize)]
 pub struct Diff {
     /// True if no decision differs.
     pub identical: bool,
@@ -56,7 +56,7 @@ pub struct Diff {
 }
 
 /// One of the two runs.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Default, Serialize)]
 pub struct ComparedRun {
     /// Result folder of the run.
     pub out: String,

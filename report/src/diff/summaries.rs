@@ -9,7 +9,7 @@ use gleaner_lambda::signals::Signals;
 use gleaner_protocol::LiveStatus;
 
 use super::compare::short;
-use super::{ChangeCounts, ComparedRun, Cost, Diff, DiffError, ValueChange};
+use super::{ComparedRun, Cost, Diff, DiffError, ValueChange};
 use crate::format::{grouped, size};
 use crate::results::JsonLines;
 use crate::run_summary::{RunSummary, TopicCounts, signals};
@@ -25,17 +25,13 @@ pub(super) fn compared(a: &Path, b: &Path) -> Result<Diff, DiffError> {
     let (read_a, read_b) = (signals(a, &mut notes)?, signals(b, &mut notes)?);
     let clips = [clips(a)?, clips(b)?];
     Ok(Diff {
-        identical: false,
         a: compared_run(a, &run_a),
         b: compared_run(b, &run_b),
         config: config(read_a.as_ref(), read_b.as_ref(), &mut notes),
         counts: counts(&run_a, &run_b, clips),
         cost: cost((&run_a, read_a.as_ref()), (&run_b, read_b.as_ref())),
         notes,
-        triggers: ChangeCounts::default(),
-        faults: ChangeCounts::default(),
-        differences: Vec::new(),
-        omitted: 0,
+        ..Diff::default()
     })
 }
 

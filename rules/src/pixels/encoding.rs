@@ -1,6 +1,7 @@
 //! Pixel encodings: the supported ones of `sensor_msgs/msg/Image`.
 
-use super::error::{PixelError, shortened};
+use super::error::PixelError;
+use crate::text::shortened;
 
 /// Arrangement of the colour filter in front of a raw sensor: the first two pixels of the first
 /// row, then of the second.

@@ -174,12 +174,3 @@ impl fmt::Display for PixelError {
 }
 
 impl std::error::Error for PixelError {}
-
-/// Cuts `name` for a message: a hostile one must not fill the log.
-pub(super) fn shortened(name: &str) -> String {
-    const LONGEST: usize = 40;
-    match name.char_indices().nth(LONGEST) {
-        None => name.to_owned(),
-        Some((end, _)) => format!("{}…", &name[..end]),
-    }
-}

@@ -11,19 +11,15 @@ use gleaner_tests::live::{JsonReport, run};
 use gleaner_tests::{LambdaCopy, TempFolder, program};
 use libtest_mimic::Failed;
 
-use crate::DdsCase;
+use crate::{DdsCase, case};
 
 pub const CASES: &[DdsCase] = &[
-    DdsCase {
-        name: "triggers_suppressed_by_a_full_disk_are_in_the_summary_and_in_the_report",
-        needs: &[],
-        run: disk_suppressed,
-    },
-    DdsCase {
-        name: "a_recorder_accepts_a_lambda_with_the_lower_limits_of_its_vehicle",
-        needs: &[],
-        run: on_a_vehicle,
-    },
+    case(
+        "triggers_suppressed_by_a_full_disk_are_in_the_summary_and_in_the_report",
+        &[],
+        disk_suppressed,
+    ),
+    case("a_recorder_accepts_a_lambda_with_the_lower_limits_of_its_vehicle", &[], on_a_vehicle),
 ];
 
 fn disk_suppressed() -> Result<(), Failed> {

@@ -14,31 +14,17 @@ use libtest_mimic::Failed;
 
 use crate::receiver::{TopicReceiver, join};
 use crate::rtps::{ANY, Entity, SPDP_READER, broken, data_frag, packet, valid_packets};
-use crate::{DdsCase, Need};
+use crate::{DdsCase, Need, case};
 
 const CYCLONE: Need = Need::Peer(PeerKind::Cyclone);
 
 pub const CASES: &[DdsCase] = &[
-    DdsCase {
-        name: "packets_lost_by_the_network_are_counted",
-        needs: &[CYCLONE, Need::Nft],
-        run: lossy,
-    },
-    DdsCase {
-        name: "a_thousand_broken_packets_do_no_harm",
-        needs: &[CYCLONE],
-        run: broken_packets,
-    },
-    DdsCase {
-        name: "fragments_of_messages_that_never_complete_take_bounded_memory",
-        needs: &[CYCLONE],
-        run: || claims(1 << 19),
-    },
-    DdsCase {
-        name: "a_fragment_that_claims_four_gib_takes_no_memory",
-        needs: &[CYCLONE],
-        run: || claims(u32::MAX),
-    },
+    case("packets_lost_by_the_network_are_counted", &[CYCLONE, Need::Nft], lossy),
+    case("a_thousand_broken_packets_do_no_harm", &[CYCLONE], broken_packets),
+    case("fragments_of_messages_that_never_complete_take_bounded_memory", &[CYCLONE], || {
+        claims(1 << 19)
+    }),
+    case("a_fragment_that_claims_four_gib_takes_no_memory", &[CYCLONE], || claims(u32::MAX)),
 ];
 
 /// Memory that hostile packets may add to this process. RustDDS keeps 128 incomplete messages of

@@ -8,73 +8,27 @@ use gleaner_transport::{Qos, Transport};
 use libtest_mimic::Failed;
 
 use crate::receiver::{ReceivedSample, TopicReceiver, join, number};
-use crate::{DdsCase, Need};
+use crate::{DdsCase, Need, case};
 
 const CYCLONE: &[Need] = &[Need::Peer(PeerKind::Cyclone)];
 const FAST: &[Need] = &[Need::Peer(PeerKind::Fast)];
 
 pub const CASES: &[DdsCase] = &[
-    DdsCase {
-        name: "an_imu_of_cyclone_arrives_complete",
-        needs: CYCLONE,
-        run: || imu(PeerKind::Cyclone),
-    },
-    DdsCase {
-        name: "an_imu_of_fast_dds_arrives_complete",
-        needs: FAST,
-        run: || imu(PeerKind::Fast),
-    },
-    DdsCase {
-        name: "an_imu_of_python_arrives_complete",
-        needs: &[Need::Peer(PeerKind::Python)],
-        run: || imu(PeerKind::Python),
-    },
-    DdsCase {
-        name: "images_of_cyclone_in_1080p_arrive_complete",
-        needs: CYCLONE,
-        run: || images(PeerKind::Cyclone),
-    },
-    DdsCase {
-        name: "images_of_fast_dds_in_1080p_arrive_complete",
-        needs: FAST,
-        run: || images(PeerKind::Fast),
-    },
-    DdsCase {
-        name: "compressed_images_of_cyclone_arrive_complete",
-        needs: CYCLONE,
-        run: || compressed(PeerKind::Cyclone),
-    },
-    DdsCase {
-        name: "compressed_images_of_fast_dds_arrive_complete",
-        needs: FAST,
-        run: || compressed(PeerKind::Fast),
-    },
-    DdsCase {
-        name: "point_clouds_of_cyclone_arrive_complete",
-        needs: CYCLONE,
-        run: || clouds(PeerKind::Cyclone),
-    },
-    DdsCase {
-        name: "point_clouds_of_fast_dds_arrive_complete",
-        needs: FAST,
-        run: || clouds(PeerKind::Fast),
-    },
-    DdsCase {
-        name: "samples_of_a_best_effort_writer_are_received",
-        needs: CYCLONE,
-        run: best_effort,
-    },
-    DdsCase {
-        name: "earlier_samples_of_a_transient_local_writer_are_received",
-        needs: CYCLONE,
-        run: transient_local,
-    },
-    DdsCase { name: "writers_with_different_qos_are_both_received", needs: CYCLONE, run: mixed },
-    DdsCase {
-        name: "a_publisher_that_is_killed_and_restarted_is_received_again",
-        needs: CYCLONE,
-        run: restarts,
-    },
+    case("an_imu_of_cyclone_arrives_complete", CYCLONE, || imu(PeerKind::Cyclone)),
+    case("an_imu_of_fast_dds_arrives_complete", FAST, || imu(PeerKind::Fast)),
+    case("an_imu_of_python_arrives_complete", &[Need::Peer(PeerKind::Python)], || {
+        imu(PeerKind::Python)
+    }),
+    case("images_of_cyclone_in_1080p_arrive_complete", CYCLONE, || images(PeerKind::Cyclone)),
+    case("images_of_fast_dds_in_1080p_arrive_complete", FAST, || images(PeerKind::Fast)),
+    case("compressed_images_of_cyclone_arrive_complete", CYCLONE, || compressed(PeerKind::Cyclone)),
+    case("compressed_images_of_fast_dds_arrive_complete", FAST, || compressed(PeerKind::Fast)),
+    case("point_clouds_of_cyclone_arrive_complete", CYCLONE, || clouds(PeerKind::Cyclone)),
+    case("point_clouds_of_fast_dds_arrive_complete", FAST, || clouds(PeerKind::Fast)),
+    case("samples_of_a_best_effort_writer_are_received", CYCLONE, best_effort),
+    case("earlier_samples_of_a_transient_local_writer_are_received", CYCLONE, transient_local),
+    case("writers_with_different_qos_are_both_received", CYCLONE, mixed),
+    case("a_publisher_that_is_killed_and_restarted_is_received_again", CYCLONE, restarts),
 ];
 
 fn imu(kind: PeerKind) -> Result<(), Failed> {

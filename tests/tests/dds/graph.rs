@@ -7,24 +7,16 @@ use gleaner_transport::Qos;
 use libtest_mimic::Failed;
 
 use crate::receiver::{TopicReceiver, join};
-use crate::{DdsCase, Need};
+use crate::{DdsCase, Need, case};
 
 const NEED_24: &[Need] = &[Need::Peer(PeerKind::Graph(24))];
 const NEED_16: &[Need] = &[Need::Peer(PeerKind::Graph(16))];
 
 pub const CASES: &[DdsCase] = &[
-    DdsCase {
-        name: "a_node_of_humble_sees_the_nodes_of_gleaner",
-        needs: NEED_24,
-        run: || seen(24, Some(Distro::Humble)),
-    },
-    DdsCase {
-        name: "a_node_of_jazzy_sees_the_nodes_of_gleaner",
-        needs: NEED_16,
-        run: || seen(16, Some(Distro::Newer)),
-    },
-    DdsCase { name: "the_distribution_humble_is_detected", needs: NEED_24, run: || seen(24, None) },
-    DdsCase { name: "the_distribution_jazzy_is_detected", needs: NEED_16, run: || seen(16, None) },
+    case("a_node_of_humble_sees_the_nodes_of_gleaner", NEED_24, || seen(24, Some(Distro::Humble))),
+    case("a_node_of_jazzy_sees_the_nodes_of_gleaner", NEED_16, || seen(16, Some(Distro::Newer))),
+    case("the_distribution_humble_is_detected", NEED_24, || seen(24, None)),
+    case("the_distribution_jazzy_is_detected", NEED_16, || seen(16, None)),
 ];
 
 fn seen(gid_bytes: usize, distro: Option<Distro>) -> Result<(), Failed> {

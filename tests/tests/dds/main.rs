@@ -42,6 +42,10 @@ struct DdsCase {
     run: CaseFn,
 }
 
+const fn case(name: &'static str, needs: &'static [Need], run: CaseFn) -> DdsCase {
+    DdsCase { name, needs, run }
+}
+
 /// Environment variable with the case that this process runs.
 const CASE: &str = "GLEANER_DDS_CASE";
 

@@ -12,29 +12,13 @@ use gleaner_tests::{LambdaCopy, TempFolder, program, root};
 use gleaner_vitals::usage::ProcessUsage;
 use libtest_mimic::Failed;
 
-use crate::{DdsCase, Need};
+use crate::{DdsCase, Need, case};
 
 pub const CASES: &[DdsCase] = &[
-    DdsCase {
-        name: "the_ingress_alone_has_real_time_priority",
-        needs: &[Need::RealTime],
-        run: ingress_alone,
-    },
-    DdsCase {
-        name: "memory_for_images_is_mapped_before_they_arrive",
-        needs: &[Need::RealTime],
-        run: memory_is_mapped,
-    },
-    DdsCase {
-        name: "without_the_permission_the_ingress_warns_and_receives",
-        needs: &[Need::RealTime],
-        run: not_permitted,
-    },
-    DdsCase {
-        name: "the_ingress_of_a_vehicle_has_it_if_its_file_says_so",
-        needs: &[Need::RealTime],
-        run: of_a_vehicle,
-    },
+    case("the_ingress_alone_has_real_time_priority", &[Need::RealTime], ingress_alone),
+    case("memory_for_images_is_mapped_before_they_arrive", &[Need::RealTime], memory_is_mapped),
+    case("without_the_permission_the_ingress_warns_and_receives", &[Need::RealTime], not_permitted),
+    case("the_ingress_of_a_vehicle_has_it_if_its_file_says_so", &[Need::RealTime], of_a_vehicle),
 ];
 
 /// Policies of `sched(7)`, as `/proc/PID/stat` has them.

@@ -11,7 +11,7 @@ use gleaner_tests::peers::{PATIENCE, Peer, PeerEvent, PeerKind};
 use libtest_mimic::Failed;
 
 use crate::receiver::join;
-use crate::{DdsCase, Need};
+use crate::{DdsCase, Need, case};
 
 const CYCLONE: &[Need] = &[Need::Peer(PeerKind::Cyclone)];
 const FAST: &[Need] = &[Need::Peer(PeerKind::Fast)];
@@ -22,61 +22,29 @@ const COMPRESSED: MessageType = MessageType::CompressedImage(5_000);
 const CLOUD: MessageType = MessageType::PointCloud2(4_096);
 
 pub const CASES: &[DdsCase] = &[
-    DdsCase {
-        name: "cyclone_receives_the_imu",
-        needs: CYCLONE,
-        run: || received_by(PeerKind::Cyclone, MessageType::Imu),
-    },
-    DdsCase {
-        name: "cyclone_receives_the_time_reference",
-        needs: CYCLONE,
-        run: || received_by(PeerKind::Cyclone, MessageType::TimeReference),
-    },
-    DdsCase {
-        name: "cyclone_receives_the_images",
-        needs: CYCLONE,
-        run: || received_by(PeerKind::Cyclone, IMAGE),
-    },
-    DdsCase {
-        name: "cyclone_receives_the_compressed_images",
-        needs: CYCLONE,
-        run: || received_by(PeerKind::Cyclone, COMPRESSED),
-    },
-    DdsCase {
-        name: "cyclone_receives_the_point_clouds",
-        needs: CYCLONE,
-        run: || received_by(PeerKind::Cyclone, CLOUD),
-    },
-    DdsCase {
-        name: "fast_dds_receives_the_imu",
-        needs: FAST,
-        run: || received_by(PeerKind::Fast, MessageType::Imu),
-    },
-    DdsCase {
-        name: "fast_dds_receives_the_images",
-        needs: FAST,
-        run: || received_by(PeerKind::Fast, IMAGE),
-    },
-    DdsCase {
-        name: "fast_dds_receives_the_compressed_images",
-        needs: FAST,
-        run: || received_by(PeerKind::Fast, COMPRESSED),
-    },
-    DdsCase {
-        name: "fast_dds_receives_the_point_clouds",
-        needs: FAST,
-        run: || received_by(PeerKind::Fast, CLOUD),
-    },
-    DdsCase {
-        name: "python_receives_the_imu",
-        needs: &[Need::Peer(PeerKind::Python)],
-        run: || received_by(PeerKind::Python, MessageType::Imu),
-    },
-    DdsCase {
-        name: "cyclone_receives_what_a_played_drive_has_latched_before_the_start",
-        needs: &[Need::Peer(PeerKind::Cyclone), Need::Player],
-        run: played_from_a_start,
-    },
+    case("cyclone_receives_the_imu", CYCLONE, || received_by(PeerKind::Cyclone, MessageType::Imu)),
+    case("cyclone_receives_the_time_reference", CYCLONE, || {
+        received_by(PeerKind::Cyclone, MessageType::TimeReference)
+    }),
+    case("cyclone_receives_the_images", CYCLONE, || received_by(PeerKind::Cyclone, IMAGE)),
+    case("cyclone_receives_the_compressed_images", CYCLONE, || {
+        received_by(PeerKind::Cyclone, COMPRESSED)
+    }),
+    case("cyclone_receives_the_point_clouds", CYCLONE, || received_by(PeerKind::Cyclone, CLOUD)),
+    case("fast_dds_receives_the_imu", FAST, || received_by(PeerKind::Fast, MessageType::Imu)),
+    case("fast_dds_receives_the_images", FAST, || received_by(PeerKind::Fast, IMAGE)),
+    case("fast_dds_receives_the_compressed_images", FAST, || {
+        received_by(PeerKind::Fast, COMPRESSED)
+    }),
+    case("fast_dds_receives_the_point_clouds", FAST, || received_by(PeerKind::Fast, CLOUD)),
+    case("python_receives_the_imu", &[Need::Peer(PeerKind::Python)], || {
+        received_by(PeerKind::Python, MessageType::Imu)
+    }),
+    case(
+        "cyclone_receives_what_a_played_drive_has_latched_before_the_start",
+        &[Need::Peer(PeerKind::Cyclone), Need::Player],
+        played_from_a_start,
+    ),
 ];
 
 const COUNT: u32 = 200;

@@ -16,42 +16,32 @@ use libtest_mimic::Failed;
 
 use crate::faults::{announcement, udp_ports};
 use crate::receiver::{TopicReceiver, join};
-use crate::{DdsCase, Need};
+use crate::{DdsCase, Need, case};
 
 pub const CASES: &[DdsCase] = &[
-    DdsCase {
-        name: "fast_dds_survives_several_readers_of_its_topic",
-        needs: &[Need::Peer(PeerKind::Fast)],
-        run: || survives(PeerKind::Fast),
-    },
-    DdsCase {
-        name: "cyclone_survives_several_readers_of_its_topic",
-        needs: &[Need::Peer(PeerKind::Cyclone)],
-        run: || survives(PeerKind::Cyclone),
-    },
-    DdsCase {
-        name: "nodes_of_both_kinds_run_on_without_a_loss_while_runs_start_and_stop",
-        needs: &[Need::Peer(PeerKind::Cyclone), Need::Peer(PeerKind::Fast)],
-        run: starts_and_stops,
-    },
-    DdsCase {
-        name: "no_multicast_address_is_announced_for_samples",
-        needs: &[],
-        run: || announces_no_multicast(|| join(None)),
-    },
-    DdsCase {
-        name: "no_multicast_address_is_announced_by_a_python_lambda",
-        needs: &[],
-        run: || {
-            let out = TempFolder::new();
-            announces_no_multicast(|| {
-                let lambda =
-                    run(&root().join("tests/lambdas/ticker/python"), out.path(), &["--no-record"]);
-                lambda.until_ready();
-                Ok(lambda)
-            })
-        },
-    },
+    case("fast_dds_survives_several_readers_of_its_topic", &[Need::Peer(PeerKind::Fast)], || {
+        survives(PeerKind::Fast)
+    }),
+    case("cyclone_survives_several_readers_of_its_topic", &[Need::Peer(PeerKind::Cyclone)], || {
+        survives(PeerKind::Cyclone)
+    }),
+    case(
+        "nodes_of_both_kinds_run_on_without_a_loss_while_runs_start_and_stop",
+        &[Need::Peer(PeerKind::Cyclone), Need::Peer(PeerKind::Fast)],
+        starts_and_stops,
+    ),
+    case("no_multicast_address_is_announced_for_samples", &[], || {
+        announces_no_multicast(|| join(None))
+    }),
+    case("no_multicast_address_is_announced_by_a_python_lambda", &[], || {
+        let out = TempFolder::new();
+        announces_no_multicast(|| {
+            let lambda =
+                run(&root().join("tests/lambdas/ticker/python"), out.path(), &["--no-record"]);
+            lambda.until_ready();
+            Ok(lambda)
+        })
+    }),
 ];
 
 const TOPIC: &str = "/sensor";

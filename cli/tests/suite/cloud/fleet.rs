@@ -3,7 +3,7 @@
 use std::fs;
 
 use gleaner_protocol::vehicle_api::DeployRequest;
-use gleaner_trust::{Deployment, Floors, Labels, RootKeys, ScopedKey, TrustRoot, Verifier};
+use gleaner_trust::{Deployment, Floors, Labels, Verifier};
 use serde_json::{Value, json};
 
 use super::CloudUser;
@@ -50,20 +50,7 @@ impl CloudUser {
 
     /// Returns the deployment that was sent last, as a vehicle that trusts the key.
     fn sent(&self) -> Deployment {
-        let shown: Value = self.json(&["keys", "show", "key.pem"]);
-        let key = ScopedKey {
-            key: shown["public"].as_str().unwrap().parse().unwrap(),
-            lambdas: vec!["*".parse().unwrap()],
-            labels: Labels::new(),
-        };
-        let root = TrustRoot {
-            version: 1,
-            created: 0,
-            expires: 1,
-            root: RootKeys { threshold: 1, keys: vec![key.key.clone()] },
-            publishers: Vec::new(),
-            deployers: vec![key],
-        };
+        let root = programs::trusting(&self.done(&["keys", "show", "key.pem", "--json"]));
         let labels = Labels::from([("site".parse().unwrap(), "berlin".to_owned())]);
         let floors = Floors::default();
         let vehicle = Verifier { root: &root, floors: &floors, labels: &labels, now: 0 };

@@ -164,12 +164,9 @@ pub(crate) fn large_line(stream: &str, bytes: u64) -> String {
     let text = format!("a record of {bytes} bytes is not shown here: `gleaner logs` has it");
     let line = StreamLine {
         stream: name_in_lines(stream).to_owned(),
-        seq: 0,
-        time_ns: 0,
-        boot_ns: 0,
-        boot: String::new(),
         kind: "large".to_owned(),
         record: serde_json::json!({ "text": text }),
+        ..StreamLine::default()
     };
     super::vehicles::json(&line)
 }

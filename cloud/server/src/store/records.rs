@@ -118,12 +118,9 @@ impl CloudStore {
             let record = json!({ "to": to, "reason": "Retention", "records": removed });
             let line = StreamLine {
                 stream: name_in_lines(&stream).to_owned(),
-                seq: 0,
-                time_ns: 0,
-                boot_ns: 0,
-                boot: String::new(),
                 kind: "gap".to_owned(),
                 record,
+                ..StreamLine::default()
             };
             serde_json::to_string(&line).unwrap_or_default()
         };

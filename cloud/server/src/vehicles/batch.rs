@@ -76,12 +76,9 @@ fn damaged(stream: &str, reason: &str, line: &[u8]) -> (StreamLine, String) {
     let text = format!("the cloud cannot read a line of {} bytes: {reason}", line.len());
     let line = StreamLine {
         stream: stream.to_owned(),
-        seq: 0,
-        time_ns: 0,
-        boot_ns: 0,
-        boot: String::new(),
         kind: "damaged".to_owned(),
         record: json!({ "text": excerpt(&text) }),
+        ..StreamLine::default()
     };
     let text = serde_json::to_string(&line).unwrap_or_default();
     (line, text)

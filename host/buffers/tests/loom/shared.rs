@@ -51,12 +51,23 @@ fn alone() -> std::sync::MutexGuard<'static, ()> {
     MODEL.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
 }
 
+/// Publishes values up to `before`, and then those up to `all` while another thread reads.
+fn beside(
+    (mut writer, reader): (SharedWriter, SharedReader),
+    before: u64,
+    all: u64,
+    read: fn(&SharedReader),
+) {
+    (0..before).for_each(|value| publish(&mut writer, value));
+    let reading = thread::spawn(move || read(&reader));
+    (before..all).for_each(|value| publish(&mut writer, value));
+    reading.join().unwrap();
+}
+
 /// One sample under a hazard, while the writer takes slots.
 fn one() {
     loom::model(|| {
-        let (mut writer, reader) = topic(1, 3, 0, 1);
-        publish(&mut writer, 0);
-        let reading = thread::spawn(move || {
+        beside(topic(1, 3, 0, 1), 1, 4, |reader| {
             if let Some(hold) = reader.get(0).unwrap() {
                 check(&hold);
                 check(&hold);
@@ -65,10 +76,6 @@ fn one() {
                 check(&hold);
             }
         });
-        for value in 1..4 {
-            publish(&mut writer, value);
-        }
-        reading.join().unwrap();
     });
 }
 
@@ -83,11 +90,8 @@ fn a_held_sample_does_not_change() {
 fn a_sample_in_a_slot_that_was_freed_before_does_not_change() {
     let _alone = alone();
     loom::model(|| {
-        let (mut writer, reader) = warm_topic(1, 5, 4, (0, 1));
-        for value in 0..4 {
-            publish(&mut writer, value);
-        }
-        let reading = thread::spawn(move || {
+        // The first frees three slots, the last two of them again.
+        beside(warm_topic(1, 5, 4, (0, 1)), 4, 8, |reader| {
             if let Some(hold) = reader.get(3).unwrap() {
                 check(&hold);
             }
@@ -95,11 +99,6 @@ fn a_sample_in_a_slot_that_was_freed_before_does_not_change() {
                 check(&hold);
             }
         });
-        // The first frees three slots, the last two of them again.
-        for value in 4..8 {
-            publish(&mut writer, value);
-        }
-        reading.join().unwrap();
     });
 }
 
@@ -107,18 +106,11 @@ fn a_sample_in_a_slot_that_was_freed_before_does_not_change() {
 fn a_held_window_does_not_change() {
     let _alone = alone();
     loom::model(|| {
-        let (mut writer, reader) = topic(2, 5, 1, 0);
-        publish(&mut writer, 0);
-        publish(&mut writer, 1);
-        let reading = thread::spawn(move || {
+        beside(topic(2, 5, 1, 0), 2, 6, |reader| {
             if let Some(window) = reader.window(0, 2).unwrap() {
                 window.iter().for_each(check);
             }
         });
-        for value in 2..6 {
-            publish(&mut writer, value);
-        }
-        reading.join().unwrap();
     });
 }
 
@@ -152,17 +144,11 @@ fn a_held_sample_stays_while_other_words_move() {
 fn meta_data_without_a_hold_is_that_of_its_position() {
     let _alone = alone();
     loom::model(|| {
-        let (mut writer, reader) = topic(1, 3, 0, 1);
-        publish(&mut writer, 0);
-        let reading = thread::spawn(move || {
+        beside(topic(1, 3, 0, 1), 1, 4, |reader| {
             for position in 0..2 {
                 assert!(reader.meta(position).is_none_or(|meta| meta[0] == position));
             }
         });
-        publish(&mut writer, 1);
-        publish(&mut writer, 2);
-        publish(&mut writer, 3);
-        reading.join().unwrap();
     });
 }
 
@@ -193,14 +179,9 @@ fn a_shared_hold_protects_until_both_threads_are_done() {
 fn the_newest_sample_is_never_missing() {
     let _alone = alone();
     loom::model(|| {
-        let (mut writer, reader) = topic(1, 3, 0, 1);
-        publish(&mut writer, 0);
-        let reading = thread::spawn(move || {
+        beside(topic(1, 3, 0, 1), 1, 3, |reader| {
             assert!(reader.newest_before(u64::MAX).unwrap().is_some());
         });
-        publish(&mut writer, 1);
-        publish(&mut writer, 2);
-        reading.join().unwrap();
     });
 }
 
@@ -208,14 +189,9 @@ fn the_newest_sample_is_never_missing() {
 fn the_newest_window_is_never_missing() {
     let _alone = alone();
     loom::model(|| {
-        let (mut writer, reader) = topic(2, 5, 1, 0);
-        publish(&mut writer, 0);
-        publish(&mut writer, 1);
-        let reading = thread::spawn(move || {
+        beside(topic(2, 5, 1, 0), 2, 3, |reader| {
             assert!(reader.last_before(u64::MAX, 2).unwrap().is_some());
         });
-        publish(&mut writer, 2);
-        reading.join().unwrap();
     });
 }
 

@@ -225,7 +225,8 @@ fn damage_before_a_part_costs_its_latched_samples_alone_and_is_reported_at_its_e
             with += 1;
             // The lost one may have replaced the other: neither is known to be valid.
             assert_eq!(memory.values(), of_part().collect::<Vec<_>>());
-            assert_eq!(damage(error).0, bad.chunk_start_offset);
+            let Some(ReplayError::WithoutLatched { source }) = error else { panic!("{error:?}") };
+            assert_eq!(damage(Some(*source)).0, bad.chunk_start_offset);
         } else {
             without += 1;
             let latched = [(FROM, 0), (FROM, 70)].into_iter();

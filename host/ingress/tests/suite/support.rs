@@ -12,7 +12,7 @@ use gleaner_protocol::ingress::{
     AddReader, HoldGrant, IngressControl, IngressReport, IngressStatus, PublishGrant, TopicGrant,
 };
 use gleaner_transport::loopback::Loopback;
-use gleaner_transport::{Delivery, Guid, LiveSource, Qos, SampleMeta, StoredMeta};
+use gleaner_transport::{Delivery, Guid, LiveSource, SampleMeta, StoredMeta};
 
 /// Time after which an awaited event is missing.
 pub const TIMEOUT: Duration = Duration::from_secs(60);
@@ -182,14 +182,12 @@ pub fn grant(id: u32, topic: &str) -> TopicGrant {
         id,
         topic: topic.to_owned(),
         type_name: Some(TYPE.to_owned()),
-        qos: Qos::Auto,
         queue: 8,
         max_bytes: Some(64),
         depth: 64,
         holds: HoldGrant { windows: 1, window: 8, singles: 4 },
         wakes: true,
-        digests: false,
-        shown: false,
+        ..TopicGrant::default()
     }
 }
 

@@ -60,7 +60,7 @@ pub enum WindowStep {
 }
 
 /// The windows of all lambdas.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct Windows {
     lambdas: Vec<WindowLambda>,
     longest_preroll_ns: i64,
@@ -97,15 +97,7 @@ const LATE_NS: i64 = 1_000_000_000;
 impl Windows {
     /// Creates a state without lambdas and windows. A clip covers `max_length_ns` at most.
     pub fn new(max_length_ns: i64) -> Windows {
-        Windows {
-            lambdas: Vec::new(),
-            longest_preroll_ns: 0,
-            max_length_ns,
-            grace_ns: 0,
-            now: i64::MIN,
-            open: None,
-            pending: Vec::new(),
-        }
+        Windows { max_length_ns, now: i64::MIN, ..Windows::default() }
     }
 
     /// Adds a lambda; they are numbered from 0.

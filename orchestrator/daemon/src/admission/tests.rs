@@ -5,9 +5,9 @@ use std::collections::BTreeMap;
 use gleaner_base::{ByteSize, Failure};
 use gleaner_lambda::manifest::{ItemName, LambdaKind, Sha256};
 use gleaner_lambda::{Manifest, Vehicle};
+use gleaner_protocol::LiveStatus;
 use gleaner_protocol::inference::{InferenceStatus, LoadedModel, ModelState};
 use gleaner_protocol::supervision::{LambdaPhase, LambdaStatus, ProcessStatus, SupervisorStatus};
-use gleaner_protocol::{LiveStatus, WakeCounts};
 
 use super::demand::DemandModel;
 use super::measured::MeasuredUse;
@@ -232,28 +232,19 @@ fn status(up_s: f64, cpu_s: f64, wakes: u64, restarts: u32, runs: u64) -> Superv
         attempt: 1,
         phase: LambdaPhase::Running,
         phase_s: up_s,
-        pid: None,
         restarts,
-        last_end: None,
         live: Some(Box::new(live)),
-        recent: WakeCounts::default(),
-        layers: Vec::new(),
+        ..LambdaStatus::default()
     };
     let model = LoadedModel {
         sha256: digest('c').to_string(),
         path: "m.onnx".to_owned(),
-        providers: Vec::new(),
         threads: 1,
         lambdas: vec!["test".to_owned(), "other".to_owned()],
         state: ModelState::Ready,
-        runtime: String::new(),
-        reason: String::new(),
-        built_for: None,
-        load_ns: 0,
         runs,
-        shared: 0,
-        failed: 0,
         run_ns: runs * 5_000_000,
+        ..LoadedModel::default()
     };
     let last = InferenceStatus { models: vec![model], ..InferenceStatus::default() };
     let inference = ProcessStatus { last: Some(Box::new(last)), ..ProcessStatus::default() };

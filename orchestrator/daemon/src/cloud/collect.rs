@@ -119,12 +119,9 @@ mod tests {
     fn line(kind: &str, record: Value) -> StreamLine {
         StreamLine {
             stream: "a".to_owned(),
-            seq: 0,
-            time_ns: 0,
-            boot_ns: 0,
-            boot: String::new(),
             kind: kind.to_owned(),
             record,
+            ..StreamLine::default()
         }
     }
 

@@ -17,7 +17,7 @@ pub enum InferenceReport {
 }
 
 /// A model that is loaded once for all lambdas that name it with the same options.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct LoadedModel {
     /// SHA-256 of the file.
     pub sha256: String,
@@ -50,10 +50,11 @@ pub struct LoadedModel {
 }
 
 /// State of a model.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ModelState {
     /// It is being checked, loaded and run for the first time.
+    #[default]
     Warming,
     /// It can run.
     Ready,

@@ -38,7 +38,7 @@ pub struct PublishGrant {
 }
 
 /// A topic that a reader may read.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct TopicGrant {
     /// Identifies the topic in messages to this reader: for a lambda, the index of its input.
     pub id: u32,
@@ -67,7 +67,7 @@ pub struct TopicGrant {
 }
 
 /// Samples of one topic that a reader may hold at a time.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct HoldGrant {
     /// Number of windows: samples at neighbouring positions.
     pub windows: u16,

@@ -174,15 +174,10 @@ mod tests {
         TopicGrant {
             id,
             topic: "/imu".to_owned(),
-            type_name: None,
-            qos: Qos::Auto,
             queue: 1,
-            max_bytes: None,
             depth: 1,
             holds: HoldGrant { windows: 1, window: 1, singles: 0 },
-            wakes: false,
-            digests: false,
-            shown: false,
+            ..TopicGrant::default()
         }
     }
 

@@ -39,7 +39,7 @@ pub enum ReaderMessage {
 }
 
 /// A topic in shared memory.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct AttachedTopic {
     /// Its id, from the grant.
     pub id: u32,
@@ -73,7 +73,7 @@ pub struct AttachedTopic {
 }
 
 /// Sizes of the memory of a topic.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RegionLayout {
     /// Samples that the topic shows at most.
     pub depth: u32,

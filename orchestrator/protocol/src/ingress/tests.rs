@@ -23,8 +23,7 @@ fn grant(id: u32) -> TopicGrant {
         depth: 20,
         holds: HoldGrant { windows: 1, window: 20, singles: 3 },
         wakes: id == 0,
-        digests: false,
-        shown: false,
+        ..TopicGrant::default()
     }
 }
 
@@ -234,9 +233,7 @@ fn attached(definitions: usize) -> ReaderMessage {
         digests: 3,
         refused: 4,
         definitions: Some("x".repeat(definitions)),
-        type_hash: None,
-        is_recorded: false,
-        offered_qos: None,
+        ..AttachedTopic::default()
     }))
 }
 

@@ -11,7 +11,7 @@ const MISSING: std::ops::Range<usize> = HEAD + 8..HEAD + 12;
 const BATCH: usize = 64;
 
 /// Queued wakes, oldest first, up to a maximum number of bytes.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(super) struct Queue {
     frames: VecDeque<QueuedFrame>,
     bytes: usize,
@@ -34,15 +34,7 @@ struct QueuedFrame {
 
 impl Queue {
     pub(super) fn new(max_bytes: usize) -> Queue {
-        Queue {
-            frames: VecDeque::new(),
-            bytes: 0,
-            max_bytes,
-            sent: 0,
-            missing: 0,
-            wakes_dropped: 0,
-            triggers_lost: 0,
-        }
+        Queue { max_bytes, ..Queue::default() }
     }
 
     /// Adds a wake as a frame. If the queue is full, older wakes without triggers are dropped for

@@ -10,10 +10,8 @@ use std::time::Duration;
 use super::frame::{self, tag};
 use super::*;
 use crate::LinkLosses;
-use gleaner_journal::{
-    InputView, JournalEntry, JournalHeader, JournalInput, LogDigest, WakeSource,
-};
-use gleaner_lambda::manifest::{LambdaKind, Limits};
+use gleaner_journal::{InputView, JournalEntry, JournalHeader, JournalInput, WakeSource};
+use gleaner_lambda::manifest::Limits;
 use gleaner_lambda::{Fault, FaultKind, Trigger, TriggerKind};
 
 pub(super) const TIMEOUT: Duration = Duration::from_secs(60);
@@ -31,18 +29,10 @@ pub(super) fn header(lambda: &str) -> JournalHeader {
         machine: "x".to_owned(),
         lambda: lambda.to_owned(),
         version: "0.1.0".to_owned(),
-        kind: LambdaKind::Wasm,
-        files: Vec::new(),
-        models: Vec::new(),
-        manifest: String::new(),
         inputs: vec![input],
         event_input: Some(0),
-        config: serde_json::Map::new(),
-        remaps: Vec::new(),
         clock: "x".to_owned(),
-        part: Default::default(),
-        wakes_before: 0,
-        limits: Default::default(),
+        ..JournalHeader::default()
     }
 }
 
@@ -58,9 +48,8 @@ pub(super) fn entry(at_ns: i64, label: Option<&str>) -> JournalEntry {
         cause: WakeSource::Sample { writer: [7; 16], seq: at_ns as u64 },
         seen: vec![InputView { new: 1, digest: 5, newest: Some(([7; 16], 1)), reach: 2 }],
         triggers: label.map(trigger).into_iter().collect(),
-        fault: None,
         fuel: Some(9),
-        log: LogDigest::default(),
+        ..JournalEntry::default()
     }
 }
 

@@ -108,7 +108,7 @@ impl<S> ProcessStatus<S> {
 }
 
 /// The status of a lambda.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct LambdaStatus {
     /// Id of its deployment.
     pub id: String,
@@ -154,10 +154,11 @@ impl LambdaStatus {
 }
 
 /// Phase of a lambda.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum LambdaPhase {
     /// It waits for its start: for the ingress, or after an end.
+    #[default]
     Waiting,
     /// Its files are being checked.
     Checking,

@@ -84,18 +84,14 @@ mod tests {
         LoadedModel {
             sha256: path.repeat(64),
             path: path.to_owned(),
-            providers: Vec::new(),
             threads: 1,
-            lambdas: Vec::new(),
             state: ModelState::Ready,
             runtime: "rten".to_owned(),
-            reason: String::new(),
             load_ns: 1,
             runs,
-            shared: 0,
             failed: 1,
-            built_for: None,
             run_ns: runs * 10,
+            ..LoadedModel::default()
         }
     }
 

@@ -360,13 +360,8 @@ impl WantedState<'_> {
                     true => LambdaPhase::Waiting,
                     false => LambdaPhase::Quarantined,
                 },
-                phase_s: 0.0,
-                pid: None,
-                restarts: 0,
                 last_end: Some(failure.reason.clone()),
-                live: None,
-                recent: gleaner_protocol::WakeCounts::default(),
-                layers: Vec::new(),
+                ..LambdaStatus::default()
             },
         ));
         let place = |lambda: &LambdaStatus| {

@@ -8,9 +8,7 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
 
-use gleaner_journal::{
-    InputView, JournalEntry, JournalHeader, JournalInput, JournalReader, LogDigest, WakeSource,
-};
+use gleaner_journal::{InputView, JournalEntry, JournalHeader, JournalInput, JournalReader};
 use gleaner_lambda::manifest::{LambdaKind, Manifest, Store};
 use gleaner_lambda::{Clip, Trigger, TriggerKind};
 use gleaner_recorder::{
@@ -185,17 +183,10 @@ cooldown = "{cooldown}ms"
         lambda: name.to_owned(),
         version: "1.2.3".to_owned(),
         kind: LambdaKind::Python,
-        files: Vec::new(),
-        models: Vec::new(),
-        manifest: String::new(),
         inputs: vec![input],
         event_input: Some(0),
-        config: serde_json::Map::new(),
-        remaps: Vec::new(),
         clock: "log time of the drive".to_owned(),
-        part: Default::default(),
-        wakes_before: 0,
-        limits: Default::default(),
+        ..JournalHeader::default()
     };
     LambdaSpec { header, rules, digest: "d1e5".to_owned(), topics: topics.to_vec() }
 }
@@ -219,12 +210,9 @@ pub fn entry(at_ns: i64, kinds: &[TriggerKind]) -> JournalEntry {
     };
     JournalEntry {
         at_ns,
-        cause: WakeSource::Tick { missed: 0 },
         seen: vec![InputView::default()],
         triggers: kinds.iter().map(trigger).collect(),
-        fault: None,
-        fuel: None,
-        log: LogDigest::default(),
+        ..JournalEntry::default()
     }
 }
 

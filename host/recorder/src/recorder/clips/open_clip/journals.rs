@@ -5,6 +5,7 @@ use crate::recorder::limits::RecorderLimits;
 use crate::recorder::writer::JournalPart;
 
 /// The wakes of all lambdas; those of lambdas without windows in the clip are dropped at its end.
+#[derive(Default)]
 pub struct ClipJournals {
     limits: RecorderLimits,
     /// By lambda.
@@ -21,14 +22,7 @@ pub struct ClipJournals {
 
 impl ClipJournals {
     pub fn new(limits: RecorderLimits) -> ClipJournals {
-        ClipJournals {
-            limits,
-            parts: Vec::new(),
-            bytes: 0,
-            crowded: Vec::new(),
-            evicted: Vec::new(),
-            undelivered: Vec::new(),
-        }
+        ClipJournals { limits, ..ClipJournals::default() }
     }
 
     /// Keeps a wake.
