@@ -14,15 +14,15 @@ pub const LINES: &[(&str, usize, usize)] = &[
     ("fuzz", 4216, 86),
     ("guest-sdk-python", 5876, 4099),
     ("guest-sdk-rust", 5690, 1621),
-    ("host", 62457, 30161),
+    ("host", 62464, 30161),
     ("journal", 1869, 1266),
     ("lambda", 4610, 2186),
     ("orchestrator", 24163, 7656),
     ("player", 2242, 793),
     ("report", 2802, 913),
     ("rules", 2707, 1191),
-    ("tests", 6510, 12194),
-    ("xtask", 6853, 600),
+    ("tests", 6510, 12196),
+    ("xtask", 6956, 607),
 ];
 
 /// Files with functions of more than 80 lines, each with its reason.

@@ -8,6 +8,8 @@ use std::process::Command;
 
 use gleaner_base::{Exit, Failure};
 
+use crate::onnxruntime;
+
 /// Folders of lambdas; each lambda has a folder with one for each of its twins.
 pub(crate) const FAMILIES: [&str; 3] = ["bench/lambdas", "examples", "tests/lambdas"];
 
@@ -83,19 +85,16 @@ impl Checkout {
             .env("CARGO", &self.cargo)
             .env("CARGO_TARGET_DIR", &self.target)
             .env("GLEANER_HOME", self.path("guest-sdk-python"))
-            .env("GLEANER_PYTHON", self.python());
+            .env("GLEANER_PYTHON", self.python())
+            // That of ONNX Runtime, whose wheels send data to Microsoft otherwise.
+            .env("ORT_DISABLE_TELEMETRY", "1");
         command
-    }
-
-    /// The environment of Python that has the library of ONNX Runtime, once the demo has made it.
-    pub(crate) fn onnxruntime(&self) -> PathBuf {
-        self.target.join("onnxruntime")
     }
 
     /// A [`command`](Self::command) of a program that cargo built and that may run models.
     pub(crate) fn with_models(&self, program: &str) -> Command {
         let mut command = self.command(self.program(program));
-        command.env("VIRTUAL_ENV", self.onnxruntime());
+        onnxruntime::pass_to(self, &mut command);
         command
     }
 

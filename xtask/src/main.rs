@@ -20,6 +20,7 @@ mod fuzz;
 mod glibc;
 mod metadata;
 mod models;
+mod onnxruntime;
 mod page;
 mod peers;
 mod player;

@@ -96,7 +96,13 @@ const HEAVY: [HeavyPart; 8] = [
         name: "demo, with a cloud",
         packages: &["gleaner-player"],
         has_programs: true,
-        files: &["examples", "guest-sdk-python/gleaner", "xtask/src/demo", "xtask/src/examples.rs"],
+        files: &[
+            "examples",
+            "guest-sdk-python/gleaner",
+            "xtask/src/demo",
+            "xtask/src/examples.rs",
+            "xtask/src/onnxruntime.rs",
+        ],
         counted: ("verified clips", "signed by the vehicle"),
     },
 ];

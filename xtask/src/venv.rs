@@ -32,7 +32,7 @@ const FOR_TESTS: [(&str, &str); 10] = [
 ];
 
 /// The way out of a download that failed.
-const NETWORK: &str = "check the network, or configure a mirror for pip";
+pub(crate) const NETWORK: &str = "check the network, or configure a mirror for pip";
 
 /// Creates or completes the environment. It is created again if its Python does not run, because
 /// the system's Python was removed.

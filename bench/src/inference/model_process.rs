@@ -43,6 +43,7 @@ impl ModelProcess {
         let connections = Handover { control: Some(end), ..Handover::default() };
         connections.send(&handover).expect("it fits the socket");
         let mut child = Command::new(program("gleaner-inference"))
+            .env("ORT_DISABLE_TELEMETRY", "1")
             .stdin(OwnedFd::from(stdin))
             .stdout(Stdio::piped())
             .spawn()

@@ -175,6 +175,8 @@ fn a_killed_process_of_models_is_started_again_and_no_lambda_is_lost() {
         let command = std::fs::read(format!("/proc/{before}/cmdline")).expect("it runs");
         let command = String::from_utf8_lossy(&command);
         assert!(command.contains("--memory\0") && command.contains("3221225472"), "{command}");
+        let environment = std::fs::read(format!("/proc/{before}/environ")).expect("it runs");
+        assert!(String::from_utf8_lossy(&environment).contains("ORT_DISABLE_TELEMETRY=1\0"));
         signal(before, "KILL");
         let deadline = Instant::now() + Duration::from_secs(60);
         while matches!(process()[..], [] | [_]) && process().first().is_none_or(|it| *it == before)

@@ -151,12 +151,15 @@ fn libraries(checkout: &Checkout, tree: &PackageTree) -> Result<Option<String>, 
 /// Returns the libraries, with the newest version of the C library that a program names. For
 /// another architecture `dpkg-shlibdeps` would need its packages.
 fn libraries_by_version(checkout: &Checkout, tree: &PackageTree) -> Result<String, Failure> {
-    let mut newest = None;
-    for file in tree.files()?.into_iter().filter(|file| is_elf(file)) {
-        newest = newest.max(GlibcNeeds::of(checkout, &file)?.newest());
+    let (mut newest, files) = (None, tree.files()?);
+    for file in files.iter().filter(|file| is_elf(file)) {
+        newest = newest.max(GlibcNeeds::of(checkout, file)?.newest());
     }
     let libc6 = newest.map_or("libc6".to_owned(), |newest| format!("libc6 (>= {newest})"));
-    Ok(format!("{libc6}, libgcc-s1 (>= 4.2)"))
+    // ONNX Runtime needs GLIBCXX_3.4.22 at most.
+    let has_models = files.iter().any(|file| file.to_string_lossy().contains("/libonnxruntime."));
+    let libstdcpp = if has_models { ", libstdc++6 (>= 6)" } else { "" };
+    Ok(format!("{libc6}, libgcc-s1 (>= 4.2){libstdcpp}"))
 }
 
 fn is_elf(file: &Path) -> bool {

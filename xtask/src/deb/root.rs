@@ -18,6 +18,8 @@ const PACKAGES: &str = "dbus,init-system-helpers,python3,python3-numpy,python3-v
 const SUITE: &str = "bookworm";
 /// Lambdas of both kinds, with different names, that are deployed there if they are built.
 const LAMBDAS: [&str; 2] = ["examples/hello/rust", "examples/brake-dark/python"];
+/// A lambda with a model, which is only checked there, as the folder `model`.
+const WITH_MODEL: &str = "examples/yolo-detector/rust";
 /// System calls that a container needs beyond those of systemd-nspawn.
 const CALLS: &str = "landlock_add_rule landlock_create_ruleset landlock_restrict_self pidfd_getfd";
 /// The unit that runs the test in a container, and ends it.
@@ -109,6 +111,9 @@ fn prepare(
         if script.exists() {
             copy(checkout, &script, &test)?;
         }
+    }
+    if source.has_command && checkout.path(WITH_MODEL).join("build").exists() {
+        copy(checkout, &checkout.path(WITH_MODEL), &test.join("model"))?;
     }
     let mut arguments = vec!["/test/gleaner.deb".to_owned()];
     for lambda in LAMBDAS.iter().filter(|_| source.has_command) {

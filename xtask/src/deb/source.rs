@@ -13,7 +13,8 @@ pub(crate) struct PackageSource {
     pub(crate) files: &'static [(&'static str, &'static str)],
     /// Packages of cargo whose crates the programs contain.
     pub(crate) cargo_packages: &'static [&'static [&'static str]],
-    /// True if it has the command `gleaner` with its manual, and what Python lambdas need.
+    /// True if it has the command `gleaner` with its manual, what Python lambdas need, and ONNX
+    /// Runtime.
     pub(crate) has_command: bool,
     /// The most exposure that `systemd-analyze security` may report of its service, in tenths. It
     /// counts what the service must do: the network, and for lambdas devices and memory with code.

@@ -10,6 +10,7 @@ use super::licences;
 use super::source::{LIB, PackageSource};
 use crate::architecture::Architecture;
 use crate::checkout::Checkout;
+use crate::onnxruntime;
 use crate::steps;
 
 /// Completion scripts of shells.
@@ -53,6 +54,7 @@ impl PackageTree {
             tree.sdk(checkout)?;
             // The command of this machine: that of the package may be for another one.
             tree.generated(checkout, &programs.join("gleaner"), architecture)?;
+            tree.onnxruntime(checkout, architecture, &source.doc())?;
         }
         licences::write(checkout, &tree, source)?;
         Ok(tree)
@@ -110,6 +112,23 @@ impl PackageTree {
                     self.place(&file, &lib.join(folder).join(name))?;
                 }
             }
+        }
+        Ok(())
+    }
+
+    /// The library that runs models, unchanged, with its licences.
+    fn onnxruntime(
+        &self,
+        checkout: &Checkout,
+        architecture: Architecture,
+        doc: &str,
+    ) -> Result<(), Failure> {
+        let Some(package) = onnxruntime::fetch(checkout, architecture) else { return Ok(()) };
+        let library = onnxruntime::library(&package);
+        let place = Path::new(LIB).join(library.file_name().unwrap_or_default());
+        set_mode(&self.place(&library, &place)?, 0o644)?;
+        for name in onnxruntime::LICENCES {
+            self.place(&package.join(name), &Path::new(doc).join("onnxruntime").join(name))?;
         }
         Ok(())
     }

@@ -17,11 +17,12 @@ use std::ffi::OsString;
 
 use gleaner_base::{Exit, Failure};
 
+use crate::architecture::Architecture;
 use crate::checkout::Checkout;
 use crate::examples::{DRIVE, EXAMPLES, Example};
+use crate::onnxruntime;
 use crate::setup;
 use crate::steps::Steps;
-use crate::venv;
 
 pub(crate) use vehicle_run::{COMMAND as VEHICLE_COMMAND, run as run_vehicle};
 
@@ -63,10 +64,7 @@ pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, F
     steps.begin("programs of a vehicle");
     setup::vehicle_programs(checkout)?;
     steps.begin(&format!("replay of {DRIVE} with a model"));
-    let package = [("onnxruntime", "onnxruntime")];
-    if let Err(failure) = venv::apart(checkout, &checkout.onnxruntime(), &package) {
-        println!("{failure}\nmodels run on rten instead of ONNX Runtime");
-    }
+    onnxruntime::fetch(checkout, Architecture::of_this_machine());
     let agree = drive::run(checkout, &with_models)? && others_agree;
     drive::print_files(checkout);
     if options.has_cloud {

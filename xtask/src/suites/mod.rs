@@ -19,10 +19,12 @@ use std::time::Instant;
 
 use gleaner_base::{Exit, Failure};
 
+use crate::architecture::Architecture;
 use crate::bindings;
 use crate::checkout::{Checkout, FAMILIES};
 use crate::fuzz;
 use crate::metadata::Metadata;
+use crate::onnxruntime;
 use crate::player;
 use crate::setup;
 use crate::steps::{Steps, succeeds};
@@ -96,8 +98,9 @@ fn run_tests(checkout: &Checkout) -> Result<Exit, Failure> {
     let mut steps = Steps::of(setup::STEPS + 2);
     setup::run(checkout, &mut steps, &checkout.lambdas(&FAMILIES))?;
     fuzz::driver(checkout)?;
-    steps.begin("mypy, pytest, drive readers and notebook tools");
+    steps.begin("mypy, pytest, drive readers, notebook tools and ONNX Runtime");
     venv::set_up_for_tests(checkout)?;
+    onnxruntime::fetch(checkout, Architecture::of_this_machine());
     let mut suites = suites(checkout)?;
     suites.extend(player_suites(checkout)?);
     steps.begin(&format!("{} suites, {AT_A_TIME} at a time", suites.len()));
@@ -191,6 +194,7 @@ fn has_nextest(checkout: &Checkout) -> bool {
 fn nextest(checkout: &Checkout, arguments: &[&str]) -> Suite {
     let mut nextest = checkout.cargo();
     nextest.args(["nextest", "run", "--release"]).args(arguments);
+    onnxruntime::pass_to(checkout, &mut nextest);
     let results = checkout.target().join("nextest/default/junit.xml");
     suite("cargo nextest", nextest, SuiteResults::JUnit(results))
 }
@@ -200,6 +204,7 @@ fn cargo_test(checkout: &Checkout, arguments: &[&str]) -> Command {
     let mut test = checkout.cargo();
     test.args(["test", "--release", "--no-fail-fast"]).args(arguments);
     test.args(["--", "--show-output"]);
+    onnxruntime::pass_to(checkout, &mut test);
     test
 }
 

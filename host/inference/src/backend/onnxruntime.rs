@@ -122,7 +122,14 @@ impl Backend for OnnxRuntime {
         model: Vec<u8>,
         options: &LoadOptions<'_>,
     ) -> Result<Box<dyn LoadedGraph>, BackendError> {
-        let session = self.session(&model, options).map_err(BackendError::new)?;
+        let session = self.session(&model, options).map_err(|error| match options.provider {
+            ExecutionProvider::Cpu => BackendError::new(error),
+            // Most libraries are for the CPU only.
+            _ => BackendError::new(format_args!(
+                "{error} ({}; ORT_DYLIB_PATH can name another library)",
+                self.version
+            )),
+        })?;
         let signature = options.signature;
         let inputs = signature.inputs.clone();
         let outputs = signature.outputs.iter().map(|output| output.tensor.clone()).collect();

@@ -11,9 +11,9 @@ use clap::Parser;
 #[command(name = "gleaner-inference", version)]
 pub(super) struct Args {
     /// Library of ONNX Runtime. Default, in this order: the file in the environment variable
-    /// ORT_DYLIB_PATH; the newest libonnxruntime.so* in the folder of this program; in the package
-    /// `onnxruntime` of the environment of Python that VIRTUAL_ENV names; in /usr/local/lib; in
-    /// /usr/lib; in their packages of Python. Without one, models run by rten.
+    /// ORT_DYLIB_PATH; the newest libonnxruntime.so* in the package `onnxruntime` of the
+    /// environment of Python that VIRTUAL_ENV names; in /usr/local/lib; in /usr/lib; in their
+    /// packages of Python; in the folder of this program. Without one, models run by rten.
     #[arg(long, value_name = "FILE")]
     pub(super) ort_lib: Option<PathBuf>,
     /// Write the engines of models that `tensorrt` loads into this folder; engines that were built

@@ -30,16 +30,16 @@ pub(super) const FOLDERS: [&str; 6] = [
 ];
 
 /// Returns the path of the library: `given`, or the environment variable, or the first file in the
-/// folder of this program, in the package `onnxruntime` of the active environment of Python, in
-/// folders of the system, and in its packages of Python.
+/// package `onnxruntime` of the active environment of Python, in folders of the system, in its
+/// packages of Python, and in the folder of this program, where our packages have one for the CPU.
 pub(super) fn find(given: Option<&Path>) -> Option<PathBuf> {
     let program = std::env::current_exe().ok();
     let beside = program.as_deref().and_then(Path::parent).map(Path::to_owned);
     let active = std::env::var_os(PYTHON).filter(|path| !path.is_empty()).map(PathBuf::from);
     let active = active.into_iter().flat_map(|folder| packages(&folder.join("lib")));
     let of_python = PYTHON_FOLDERS.iter().flat_map(|folder| packages(Path::new(folder)));
-    let folders = beside.into_iter().chain(active);
-    let folders = folders.chain(FOLDERS.map(PathBuf::from)).chain(of_python);
+    // Last, as the library that the user has installed may be for a GPU.
+    let folders = active.chain(FOLDERS.map(PathBuf::from)).chain(of_python).chain(beside);
     find_in(given, std::env::var_os(VARIABLE), folders)
 }
 
@@ -74,8 +74,8 @@ fn is_private(file: &Path) -> bool {
 /// Names the places that were searched, for the reason why there is no library.
 pub(super) fn searched() -> String {
     format!(
-        "no {NAME} in {VARIABLE}, beside this program, in the package `onnxruntime` of {PYTHON}, \
-         in /usr/local/lib or in /usr/lib; `pip install onnxruntime` brings it"
+        "no {NAME} in {VARIABLE}, in the package `onnxruntime` of {PYTHON}, in /usr/local/lib, in \
+         /usr/lib or beside this program; `pip install onnxruntime` brings it"
     )
 }
 

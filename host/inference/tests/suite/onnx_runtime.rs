@@ -1,4 +1,4 @@
-//! The same through ONNX Runtime, where `GLEANER_TEST_ORT` names its library.
+//! The same through ONNX Runtime, where `ORT_DYLIB_PATH` names its library.
 
 use std::time::Duration;
 
@@ -9,9 +9,9 @@ use crate::support::{ModelProgram, TestModel, TestTensor, fault, floats, granted
 
 /// Returns the path of the library, if there is one for tests.
 pub fn library() -> Option<String> {
-    let library = std::env::var("GLEANER_TEST_ORT").ok();
+    let library = std::env::var("ORT_DYLIB_PATH").ok();
     if library.is_none() {
-        println!("skipped: GLEANER_TEST_ORT names no library of ONNX Runtime");
+        println!("skipped: ORT_DYLIB_PATH names no library of ONNX Runtime");
     }
     library
 }

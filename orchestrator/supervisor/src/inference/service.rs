@@ -328,6 +328,9 @@ impl Supervisor {
             .args(["--run-max".to_owned(), run_max.as_secs_f64().to_string()])
             .args(["--load-max".to_owned(), load_max.as_secs_f64().to_string()])
             .args(self.engines.iter().flat_map(|folder| [Path::new("--build-engines"), folder]))
+            // Wheels of ONNX Runtime since 1.29 send data to Microsoft otherwise. The call that
+            // switches that off comes too late for the first event.
+            .env("ORT_DISABLE_TELEMETRY", "1")
             // Only `gleaner` receives Ctrl-C, and ends its processes in order.
             .process_group(0)
             .stdin(OwnedFd::from(stdin))
