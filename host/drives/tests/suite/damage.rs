@@ -1,6 +1,6 @@
 //! Tests damaged drives: all promised messages come first, then one error with position and cause.
 
-use gleaner_drives::{Damage, DriveLimits, DriveOptions, Replay};
+use gleaner_drives::{Damage, DriveLimits, DriveOptions, Replay, ReplayError};
 use mcap::WriteOptions;
 use mcap::records::ChunkIndex;
 

@@ -74,6 +74,7 @@ impl ModelProgram {
             .args(args)
             .env_remove("ORT_DYLIB_PATH")
             .env_remove("VIRTUAL_ENV")
+            .env("ORT_DISABLE_TELEMETRY", "1")
             .stdin(OwnedFd::from(stdin))
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())
