@@ -5,7 +5,7 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
-use gleaner_base::{Exit, Failure, visible};
+use gleaner_base::{Exit, Failure, safe_file, visible};
 use gleaner_lambda::OutputLock;
 use gleaner_protocol::ReplaySummary;
 use gleaner_report::{Decisions, clips};
@@ -67,6 +67,7 @@ fn out_of(args: &ReplayArgs) -> PathBuf {
 fn each(args: &ReplayArgs, drives: &[Vec<PathBuf>]) -> Result<(Exit, Vec<PathBuf>), Failure> {
     let out = out_of(args);
     let folder = separate::folder(&out);
+    safe_file::refuse_linked(&folder, &args.target.lambda)?;
     let _held = OutputLock::take(&folder)?;
     if out.join("summary.json").exists() {
         eprintln!("note: the results of an earlier replay stay in `{}`", visible_path(&out));

@@ -3,7 +3,7 @@
 
 use std::path::{Path, PathBuf};
 
-use gleaner_base::{Exit, Failure, write_atomically};
+use gleaner_base::{Exit, Failure, visible, write_atomically};
 use gleaner_report::{Diff, ReportPage};
 
 use crate::args::ReportArgs;
@@ -20,10 +20,17 @@ pub(crate) fn run(args: &ReportArgs) -> Result<Exit, Failure> {
         // Its error names what is missing.
         folders.push(args.out.clone());
     }
+    let mut first = Exit::Ok;
     for folder in folders {
-        print(&format!("{}\n", write(&folder)?.display()))?;
+        match write(&folder) {
+            Ok(page) => print(&format!("{}\n", visible(&page.to_string_lossy())))?,
+            Err(failure) => {
+                eprintln!("{failure}");
+                first = if first == Exit::Ok { failure.exit } else { first };
+            }
+        }
     }
-    Ok(Exit::Ok)
+    Ok(first)
 }
 
 /// Writes the report of the run in `out` to `out`.

@@ -45,7 +45,9 @@ pub(crate) fn folder(out: &Path) -> PathBuf {
 /// Returns the folders of the results in `out`: itself, and those of separate drives.
 pub(crate) fn result_folders(out: &Path) -> Vec<PathBuf> {
     let drives = fs::read_dir(folder(out)).into_iter().flatten();
-    let mut folders: Vec<_> = drives.flatten().map(|entry| entry.path()).collect();
+    // Not links, whose targets may be the results of others.
+    let drives = drives.flatten().filter(|drive| drive.file_type().is_ok_and(|it| it.is_dir()));
+    let mut folders: Vec<_> = drives.map(|drive| drive.path()).collect();
     folders.sort();
     folders.insert(0, out.to_owned());
     folders.retain(|folder| folder.join("summary.json").is_file());
@@ -62,7 +64,7 @@ fn names(drives: &[Vec<PathBuf>]) -> Vec<String> {
         let name = file.strip_suffix(".zstd").unwrap_or(&file);
         let name = [".mcap", ".db3"].iter().find_map(|end| name.strip_suffix(end)).unwrap_or(name);
         let name = &name[..name.floor_char_boundary(NAME_BYTES)];
-        let name = if matches!(name, "" | "." | "..") { "drive" } else { name };
+        let name = if name.is_empty() || name.starts_with('.') { "drive" } else { name };
         let name: String = name.chars().map(|c| if c.is_control() { '_' } else { c }).collect();
         let mut free = (1..).map(|n| if n == 1 { name.clone() } else { format!("{name}-{n}") });
         names.extend(free.find(|name| !names.contains(name)));

@@ -4,7 +4,7 @@
 use std::env;
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::process::{self, Command};
 
 use gleaner_base::Failure;
 
@@ -64,10 +64,11 @@ fn folder(checkout: &Checkout, architecture: Architecture) -> PathBuf {
 
 fn download(checkout: &Checkout, machine: &str, folder: &Path) -> Result<(), Failure> {
     venv::set_up(checkout)?;
-    let unfinished = checkout.target().join("onnxruntime.new");
+    // Another process may fetch it, too.
+    let unfinished = checkout.target().join(format!("onnxruntime-new-{}", process::id()));
     let _ = fs::remove_dir_all(&unfinished);
     // pip takes sums from such a file only.
-    let requirements = checkout.target().join("onnxruntime.txt");
+    let requirements = unfinished.with_extension("txt");
     let sums = SHA256.map(|sum| format!(" --hash=sha256:{sum}")).concat();
     fs::write(&requirements, format!("onnxruntime=={VERSION}{sums}\n"))
         .map_err(|error| cannot("write", &requirements, &error))?;
@@ -78,7 +79,12 @@ fn download(checkout: &Checkout, machine: &str, folder: &Path) -> Result<(), Fai
     pip.arg("--requirement").arg(&requirements).arg("--target").arg(&unfinished);
     let help = format!("pip fetches onnxruntime {VERSION}: {}", venv::NETWORK);
     steps::download(&mut pip, &help)?;
-    fs::rename(&unfinished, folder).map_err(|error| cannot("move", &unfinished, &error))
+    let _ = fs::remove_file(&requirements);
+    match fs::rename(&unfinished, folder) {
+        Err(_) if folder.exists() => fs::remove_dir_all(&unfinished),
+        moved => moved,
+    }
+    .map_err(|error| cannot("move", &unfinished, &error))
 }
 
 #[cfg(test)]

@@ -43,6 +43,7 @@ impl PythonProgram {
         ];
         let mut child = Command::new(&python)
             .arg(root().join("bench/baselines/detector.py"))
+            .env("ORT_DISABLE_TELEMETRY", "1")
             .args([&model.path, frames])
             .arg(model.layout.name())
             .args(numbers)

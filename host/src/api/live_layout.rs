@@ -49,6 +49,10 @@ impl Topic {
         if layout.own.get().is_none() {
             return Ok(());
         }
+        if self.unconfirmed(self.reader().head()).is_some() {
+            let why = "the ingress has ended before it named the layout of the newest samples";
+            return Err(why.to_owned());
+        }
         if let Some(announced) = announced {
             return layout.confirm(announced);
         }
@@ -59,11 +63,15 @@ impl Topic {
     /// Returns the position of the first sample that the lambda sees and that has an announced
     /// layout, if that may be another one than that of the definitions.
     pub(crate) fn first_unconfirmed(&self) -> Option<u64> {
+        self.unconfirmed(self.until())
+    }
+
+    fn unconfirmed(&self, until: u64) -> Option<u64> {
         self.live_layout.own.get()?;
         let reader = self.reader();
         let oldest = reader.head().saturating_sub(reader.depth() as u64);
         let from = self.live_layout.unconfirmed_from.load(Ordering::Relaxed);
-        let until = self.until().min(reader.head());
+        let until = until.min(reader.head());
         let is_announced = |position: &u64| {
             reader.meta(*position).is_some_and(|meta| meta.sample.layout == SampleMeta::ANNOUNCED)
         };

@@ -45,7 +45,7 @@ impl ReplayJob {
     /// Runs the replay or the comparison, and writes reports to `reports`.
     ///
     /// For a replay, the exit is [`Exit::DriveDamaged`] if the drive is damaged, or
-    /// [`Exit::Internal`] if it could not be read to its end (results up to there are kept); else
+    /// [`Exit::Internal`] if it could not be read in full (results of what was read are kept); else
     /// [`Exit::LambdaFaulted`] if a wake faulted, else [`Exit::Ok`].
     ///
     /// # Errors

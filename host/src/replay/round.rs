@@ -244,7 +244,7 @@ struct ReplayEnd<'a> {
 /// Outcome of a replay.
 pub(super) struct ReplayOutcome {
     pub(super) summary: ReplaySummary,
-    /// Exit of a drive that could not be read to its end.
+    /// Exit of a drive that could not be read in full.
     pub(super) broken: Option<Exit>,
     /// The error that prevented signals or pictures.
     pub(super) incomplete: Option<OutputError>,

@@ -27,7 +27,8 @@ impl Replay {
     ///
     /// Writers of a drive are unknown, so these are all earlier samples of such a topic, at most
     /// 1,000 and 16 MiB of each, and 64 MiB of all; a warning counts the others. If the drive is
-    /// damaged before the part, there are none, and the replay ends with that damage.
+    /// damaged before the part, there are none, and the replay ends with
+    /// [`ReplayError::WithoutLatched`].
     pub fn begin_with_latched(&mut self, paths: &[PathBuf], options: &DriveOptions) {
         self.opened = Some((paths.to_vec(), DriveOptions { merge: true, ..options.clone() }));
     }

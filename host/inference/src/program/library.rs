@@ -56,17 +56,19 @@ fn packages(lib: &Path) -> Vec<PathBuf> {
     folders
 }
 
-/// Returns whether only root and this user can replace a file, whose path has no link: a library
-/// runs as code.
+/// Returns whether only root, this user and the owner of this program can replace a file, whose path
+/// has no link: a library runs as code.
 fn is_private(file: &Path) -> bool {
+    let program = std::env::current_exe().and_then(|program| program.metadata());
     let user = geteuid().as_raw();
+    let users = [0, user, program.map_or(user, |program| program.uid())];
     let is_private = |metadata: &Metadata| {
         let mode = metadata.mode();
         // Many systems give each user a group of the same number, without other members.
         let by_group = mode & 0o020 != 0 && metadata.gid() != metadata.uid();
         let by_others = mode & 0o002 != 0;
         let is_sticky = metadata.is_dir() && mode & 0o1000 != 0;
-        [0, user].contains(&metadata.uid()) && (is_sticky || !by_group && !by_others)
+        users.contains(&metadata.uid()) && (is_sticky || !by_group && !by_others)
     };
     file.ancestors().all(|path| path.metadata().is_ok_and(|metadata| is_private(&metadata)))
 }
