@@ -143,8 +143,7 @@ fn slow_round(behaviour: &str) -> bool {
             let now = (topic.received, topic.no_slot, topic.lost);
             is_over && before.replace(now) == Some(now)
         });
-        started.signal("INT");
-        let finished = started.finish();
+        let finished = started.interrupt();
         let ended = finished.ended();
         let topic = &ended.topics[0];
         let stale =
@@ -190,8 +189,7 @@ fn ctrl_c() {
         JsonReport::Recorder(RecorderReport::Status(status)) if status.is_recording => Some(()),
         _ => None,
     });
-    started.signal("INT");
-    let finished = started.finish();
+    let finished = started.interrupt();
     drop(player);
     assert!(finished.status.success(), "{}", finished.stderr);
     let clips = clips(out.path());
@@ -234,8 +232,7 @@ fn shared() {
         let is_over = received[0] == received[1] && received[0] > 0 && writers == [Some(0); 2];
         is_over.then_some(())
     });
-    started.signal("INT");
-    let finished = started.finish();
+    let finished = started.interrupt();
     assert!(finished.status.success(), "{}: {}", finished.status, finished.stderr);
     let imu = [0, 1].map(|index| {
         let name = ["first", "second"][index];
@@ -293,8 +290,7 @@ fn killed(name: &str) {
         });
         "restarting in 1 s (restart 1)"
     };
-    started.signal("INT");
-    let finished = started.finish();
+    let finished = started.interrupt();
     drop(player);
     assert!(finished.stderr.contains(restart), "{}", finished.stderr);
     // Reported decisions are in the file.
@@ -341,8 +337,7 @@ fn ingress_killed() {
     });
     assert_eq!(readers(), before, "they run on");
     drop(player);
-    started.signal("INT");
-    let finished = started.finish();
+    let finished = started.interrupt();
     let reason =
         "the ingress ended unexpectedly (signal: 9 (SIGKILL)); restarting in 0.1 s (restart 1)";
     assert!(finished.stderr.contains(reason), "{}", finished.stderr);
