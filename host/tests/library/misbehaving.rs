@@ -13,18 +13,14 @@ use gleaner_host::guest::{Guest, WakeOutcome};
 use gleaner_host::input::open_inputs;
 use gleaner_lambda::FaultKind;
 use gleaner_lambda::manifest::{ConfigValue, Limits, Manifest};
-use gleaner_tests::root;
+use gleaner_tests::{root, with_header};
 use gleaner_transport::loopback::Loopback;
 
 use crate::meta;
 
 const FUEL: u64 = 5_000_000;
 const MEMORY: u64 = 16 << 20;
-const IMU: &str = "std_msgs/Header header\nfloat64 x\n\
-================================================================================\n\
-MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n\
-================================================================================\n\
-MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n";
+const IMU: &str = with_header!("std_msgs/Header header\nfloat64 x\n");
 
 /// A misbehaving lambda and the transport that feeds it.
 struct MisbehavingGuest {
