@@ -203,11 +203,8 @@ fn a_refusal_in_init_ends_the_start() {
     }
     let fault = MisbehavingGuest::new("panic_in_init", FUEL, None).guest.init().unwrap_err();
     assert_eq!(fault.kind, FaultKind::Trap);
-    assert!(
-        fault.message.starts_with("in init: ") && fault.message.contains("no, not today"),
-        "{}",
-        fault.message
-    );
+    let message = &fault.message;
+    assert!(message.starts_with("in init: ") && message.contains("no, not today"), "{message}");
 }
 
 #[test]

@@ -111,10 +111,7 @@ pub fn no_writer() {
     let started = run(&lambda("examples/hello", "rust"), out.path(), &["--for", "5"]);
     let finished = started.finish();
     assert!(finished.status.success(), "{}", finished.stderr);
-    assert!(
-        finished.stderr.contains("no writer of `/imu/data` (sensor_msgs/msg/Imu) yet"),
-        "{}",
-        finished.stderr
-    );
+    let stderr = &finished.stderr;
+    assert!(stderr.contains("no writer of `/imu/data` (sensor_msgs/msg/Imu) yet"), "{stderr}");
     assert_eq!(finished.ended().topics[0].received, 0);
 }

@@ -194,11 +194,8 @@ fn ctrl_c() {
     assert!(finished.status.success(), "{}", finished.stderr);
     let clips = clips(out.path());
     assert_eq!(clips.len(), 1);
-    assert!(
-        clips[0].incomplete.iter().any(|why| why.contains("stopped")),
-        "{:?}",
-        clips[0].incomplete
-    );
+    let incomplete = &clips[0].incomplete;
+    assert!(incomplete.iter().any(|why| why.contains("stopped")), "{incomplete:?}");
     assert!(clips[0].topics.iter().all(|topic| topic.messages > 0), "{:?}", clips[0].topics);
     assert!(out.path().join("summary.json").is_file());
 }
