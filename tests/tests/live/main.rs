@@ -150,11 +150,8 @@ fn slow_round(behaviour: &str) -> bool {
             decisions(out.path()).iter().filter(|decision| !decision.triggers.is_empty()).count()
                 as u64;
         // Two may arrive between selection and check if the machine stalls in between.
-        assert!(
-            10 * stale <= ended.wakes + 10,
-            "{stale} of {} wakes were not for the newest frame",
-            ended.wakes
-        );
+        let wakes = ended.wakes;
+        assert!(10 * stale <= wakes + 10, "{stale} of {wakes} wakes were not for the newest frame");
         if behaviour == "sleep" {
             assert_eq!(ended.faults, 0, "{}", finished.stderr);
             assert_eq!(ended.wakes + topic.skipped, topic.received, "{topic:?}");

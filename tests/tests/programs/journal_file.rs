@@ -220,13 +220,10 @@ fn moments_of_listed_clips_are_in_decisions_and_journal_after_a_kill() {
             wakes.push(entry.at_ns);
         }
         for moment in clips.iter().flat_map(|clip| &clip.moments) {
-            let is_decided = decisions.iter().any(|decision| decision.at_ns == moment.at_ns);
-            assert!(is_decided, "attempt {attempt}: no decision at {} ns", moment.at_ns);
-            assert!(
-                wakes.contains(&moment.at_ns),
-                "attempt {attempt}: no wake at {} ns",
-                moment.at_ns
-            );
+            let at_ns = moment.at_ns;
+            let is_decided = decisions.iter().any(|decision| decision.at_ns == at_ns);
+            assert!(is_decided, "attempt {attempt}: no decision at {at_ns} ns");
+            assert!(wakes.contains(&at_ns), "attempt {attempt}: no wake at {at_ns} ns");
         }
         hits += usize::from(!clips.is_empty() && clips.len() < events.len());
     }
