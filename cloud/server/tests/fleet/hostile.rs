@@ -47,7 +47,7 @@ async fn a_hostile_frame_ends_its_own_connection_only() {
 
 #[tokio::test]
 async fn only_a_handshake_of_the_standard_opens_the_control_channel() {
-    let (_folder, server, admin, vehicle) = start_with_vehicle().await;
+    let (_folder, server, _, vehicle) = start_with_vehicle().await;
     // Key and answer are the example of RFC 6455, section 1.3.
     let headers = [
         ("connection", "Upgrade"),
