@@ -61,14 +61,12 @@ impl TopicMessages {
         let imu =
             messages.filter(|message| message.channel.topic == "/imu/data").collect::<Vec<_>>();
         let schema = imu[0].channel.schema.clone().expect("a schema");
+        let messages = imu.iter().map(|message| (message.log_time, message.data[4..].to_vec()));
         Self {
             topic: "/imu/data".to_owned(),
             type_name: schema.name.clone(),
             schema: String::from_utf8_lossy(&schema.data).into_owned(),
-            messages: imu
-                .iter()
-                .map(|message| (message.log_time, message.data[4..].to_vec()))
-                .collect(),
+            messages: messages.collect(),
         }
     }
 }
@@ -94,11 +92,8 @@ pub fn one_topic(
 /// Writes a drive with these topics, their messages in the order of time.
 pub fn of_topics(folder: &TempFolder, topics: &[TopicMessages]) -> PathBuf {
     let mut file = Cursor::new(Vec::new());
-    let mut writer = mcap::WriteOptions::new()
-        .profile("ros2")
-        .compression(None)
-        .create(&mut file)
-        .expect("a drive in memory");
+    let options = mcap::WriteOptions::new().profile("ros2").compression(None);
+    let mut writer = options.create(&mut file).expect("a drive in memory");
     let mut all = Vec::new();
     for TopicMessages { topic, type_name, schema, messages } in topics {
         let schema = writer.add_schema(type_name, "ros2msg", schema.as_bytes()).expect("a schema");
