@@ -54,8 +54,8 @@ pub fn figures(quick: bool) -> Vec<Figure> {
 
     let outputs = || [("", Vec::new()), ("journal", Vec::new()), ("clips", Vec::new())];
     let [imu, sample] = [
-        alternate(rounds, outputs(), |output| bench.imu_rounds(output)),
-        alternate(rounds, outputs(), |output| bench.sample_rounds(output)),
+        alternate(rounds, outputs(), |output| bench.hello_rounds(&bench.imu, output)),
+        alternate(rounds, outputs(), |output| bench.hello_rounds(&bench.sample, output)),
     ];
     let slowdown_percent = |replays: &[(&str, Vec<f64>); 3], output: usize| {
         let rates = replays[0].1.iter().zip(&replays[output].1);
@@ -106,7 +106,9 @@ fn alternate<K: Copy, const N: usize>(
 }
 
 struct ReplayBench {
+    /// Most of it is images, which `hello` does not read.
     sample: PathBuf,
+    /// 200 s of IMU alone.
     imu: PathBuf,
     _folder: TempFolder,
 }
@@ -163,17 +165,6 @@ impl ReplayBench {
         let mut rates = rounds.iter().map(|round| round.wakes_per_s).collect::<Vec<_>>();
         rates.sort_by(f64::total_cmp);
         rates[rates.len() / 2]
-    }
-
-    /// [`ReplayBench::hello_rounds`] over the sample drive, most of which is images that the lambda
-    /// does not read.
-    fn sample_rounds(&self, what: &str) -> f64 {
-        self.hello_rounds(&self.sample, what)
-    }
-
-    /// [`ReplayBench::hello_rounds`] over 200 s of IMU alone.
-    fn imu_rounds(&self, what: &str) -> f64 {
-        self.hello_rounds(&self.imu, what)
     }
 
     /// Bytes per wake of the journal of `example` in wasm.

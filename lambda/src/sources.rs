@@ -260,7 +260,8 @@ mod tests {
                  schedule.period = '1s'\n"
             );
             let manifest = Manifest::parse(&manifest, "lambda.toml").unwrap();
-            let error = failure_text(Sources::of(dir.root(), &manifest).unwrap_err());
+            let error = Sources::of(dir.root(), &manifest).unwrap_err();
+            let error = gleaner_base::Failure::from(error).to_string();
             assert!(
                 error.contains(&format!(
                     "{name}`\n  cause: it is a link to `{}`",
@@ -270,10 +271,6 @@ mod tests {
             );
             std::fs::remove_file(dir.path(name)).unwrap();
         }
-    }
-
-    fn failure_text(error: LayoutError) -> String {
-        gleaner_base::Failure::from(error).to_string()
     }
 
     #[cfg(unix)]

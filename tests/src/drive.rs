@@ -9,20 +9,35 @@ use mcap::records::MessageHeader;
 use crate::peers::message::MessageType;
 use crate::{TempFolder, sample_drive};
 
+/// Completes the definition of a type with a header by the types to which a header refers.
+#[macro_export]
+macro_rules! with_header {
+    ($definition:literal) => {
+        concat!(
+            $definition,
+            "================================================================================\n\
+             MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n\
+             ================================================================================\n\
+             MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
+        )
+    };
+}
+
 /// `sensor_msgs/msg/Image` as ROS 2 defines it.
-pub const IMAGE: &str = "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\n\
-uint8 is_bigendian\nuint32 step\nuint8[] data\n\
-================================================================================\n\
-MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n\
-================================================================================\n\
-MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n";
+pub const IMAGE: &str = with_header!(
+    "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\n\
+     uint8 is_bigendian\nuint32 step\nuint8[] data\n"
+);
 
 /// `sensor_msgs/msg/CompressedImage` as ROS 2 defines it.
-pub const COMPRESSED: &str = "std_msgs/Header header\nstring format\nuint8[] data\n\
-================================================================================\n\
-MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n\
-================================================================================\n\
-MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n";
+pub const COMPRESSED: &str = with_header!("std_msgs/Header header\nstring format\nuint8[] data\n");
+
+/// The part of `sensor_msgs/msg/Imu` that the lambda `ticker` reads.
+pub const TICKER_IMU: &str = with_header!(
+    "std_msgs/Header header\ngeometry_msgs/Vector3 linear_acceleration\n\
+     ================================================================================\n\
+     MSG: geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n"
+);
 
 /// A topic of a drive.
 pub struct TopicMessages {
@@ -46,14 +61,12 @@ impl TopicMessages {
         let imu =
             messages.filter(|message| message.channel.topic == "/imu/data").collect::<Vec<_>>();
         let schema = imu[0].channel.schema.clone().expect("a schema");
+        let messages = imu.iter().map(|message| (message.log_time, message.data[4..].to_vec()));
         Self {
             topic: "/imu/data".to_owned(),
             type_name: schema.name.clone(),
             schema: String::from_utf8_lossy(&schema.data).into_owned(),
-            messages: imu
-                .iter()
-                .map(|message| (message.log_time, message.data[4..].to_vec()))
-                .collect(),
+            messages: messages.collect(),
         }
     }
 }
@@ -79,11 +92,8 @@ pub fn one_topic(
 /// Writes a drive with these topics, their messages in the order of time.
 pub fn of_topics(folder: &TempFolder, topics: &[TopicMessages]) -> PathBuf {
     let mut file = Cursor::new(Vec::new());
-    let mut writer = mcap::WriteOptions::new()
-        .profile("ros2")
-        .compression(None)
-        .create(&mut file)
-        .expect("a drive in memory");
+    let options = mcap::WriteOptions::new().profile("ros2").compression(None);
+    let mut writer = options.create(&mut file).expect("a drive in memory");
     let mut all = Vec::new();
     for TopicMessages { topic, type_name, schema, messages } in topics {
         let schema = writer.add_schema(type_name, "ros2msg", schema.as_bytes()).expect("a schema");

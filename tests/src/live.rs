@@ -168,6 +168,12 @@ impl RunningProgram {
         self.errors.try_iter().collect::<Vec<_>>().join("\n")
     }
 
+    /// Sends it SIGINT, and waits until it ends, as [`finish`](Self::finish).
+    pub fn interrupt(self) -> Finished {
+        self.signal("INT");
+        self.finish()
+    }
+
     /// Waits until it ends by itself; returns the rest of its reports.
     ///
     /// # Panics

@@ -17,14 +17,9 @@ pub struct TestVehicle {
     orchestrator: Option<Child>,
 }
 
-impl Default for TestVehicle {
-    fn default() -> Self {
-        Self::new()
-    }
-}
-
 impl TestVehicle {
     /// Makes keys and a trust root; nothing runs yet.
+    #[allow(clippy::new_without_default)]
     pub fn new() -> Self {
         let vehicle = Self { folder: TempFolder::new(), orchestrator: None };
         for key in ["root", "publisher", "deployer", "stranger"] {

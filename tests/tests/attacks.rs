@@ -165,8 +165,7 @@ fn run_attack(attack: &str, language: &str, outcome: AttackOutcome) {
     if outcome == Garbled {
         started.until_live("garbage to be counted", |live| live.unwritten >= 100);
     }
-    started.signal("INT");
-    let finished = started.finish();
+    let finished = started.interrupt();
     let code = match outcome {
         Fault(_) | Killed(_) => Some(Exit::LambdaFaulted),
         Broken => Some(Exit::Internal),

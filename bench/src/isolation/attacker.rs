@@ -137,8 +137,7 @@ impl Attacker {
     /// attacked blocks, or attacked in quiet ones.
     pub(super) fn end(self, schedule: &BlockSchedule, figures: &mut Vec<Figure>) {
         let Self::Lambda { name, started, statuses, _folders } = self else { return };
-        started.signal("INT");
-        started.finish();
+        started.interrupt();
         let (mut limited, mut cpu_s, mut up_s) = ([0, 0], [0.0, 0.0], [0.0, 0.0]);
         for [(from_ns, before), (to_ns, after)] in statuses.array_windows() {
             let Some(block) = schedule.block(*from_ns, *to_ns) else { continue };

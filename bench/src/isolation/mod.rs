@@ -115,8 +115,7 @@ fn on_victims(quick: bool, core: usize, figures: &mut Vec<Figure>) {
         attacker.end(schedule, figures);
         assert_eq!(dds.health().dead, None, "the bench's participant died during: {attack}");
     }
-    player.signal("INT");
-    let played = player.finish();
+    let played = player.interrupt();
     assert!(played.status.success(), "{}", played.stderr);
     victims.into_iter().for_each(|victim| victim.end(figures));
 }

@@ -96,8 +96,7 @@ impl Victim {
 
     /// Stops it and reports its losses in all attacks.
     pub(super) fn end(self, figures: &mut Vec<Figure>) {
-        self.started.signal("INT");
-        let live = self.started.finish().ended();
+        let live = self.started.interrupt().ended();
         let lost = live
             .topics
             .iter()

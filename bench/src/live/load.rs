@@ -102,8 +102,7 @@ impl Load<'_> {
         }
         // The last samples may be in transit.
         thread::sleep(Duration::from_millis(500));
-        started.signal("INT");
-        let finished = started.finish();
+        let finished = started.interrupt();
         // On a busy machine a wake may miss its deadline.
         let is_complete =
             finished.status.success() || finished.status.code() == Some(Exit::LambdaFaulted as i32);

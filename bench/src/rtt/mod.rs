@@ -103,7 +103,8 @@ pub fn measure(quick: bool, options: &RttOptions, results: &mut BenchResults) {
             let granted = limit.bytes();
             let name = workload.title(granted);
             eprintln!("{name}");
-            let busy = workload.is_awake().then(|| split.for_all(BusyCores::start));
+            let is_awake = workload == Workload::EmptyAwake;
+            let busy = is_awake.then(|| split.for_all(BusyCores::start));
             if let Some(Err(error)) = &busy {
                 results.notes.push(format!("{name} is skipped: no busy cores: {error}"));
                 continue;

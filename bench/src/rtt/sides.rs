@@ -170,8 +170,7 @@ impl Side {
         match running {
             RunningSide::Bare(reader) => reader.stop(),
             RunningSide::Lambda(started, _out) => {
-                started.signal("INT");
-                let finished = started.finish();
+                let finished = started.interrupt();
                 let runtime = finished.lines.iter().find_map(|line| model_runtime(line));
                 facts.extend(runtime.map(|runtime| ("model".to_owned(), runtime)));
                 let live = finished.ended();
@@ -182,8 +181,7 @@ impl Side {
                 }
             }
             RunningSide::Node(started) => {
-                started.signal("INT");
-                let finished = started.finish();
+                let finished = started.interrupt();
                 assert!(finished.status.success(), "{}", finished.stderr);
             }
         }

@@ -75,11 +75,6 @@ impl Workload {
         matches!(self, Self::Brake720 | Self::Brake1080)
     }
 
-    /// Returns whether no core is to sleep meanwhile.
-    pub(super) fn is_awake(self) -> bool {
-        self == Self::EmptyAwake
-    }
-
     /// Returns the topic whose samples are answered, and its DDS type.
     pub(super) fn event(self) -> (&'static str, &'static str) {
         match self.is_of_images() {

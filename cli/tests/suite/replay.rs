@@ -95,11 +95,8 @@ fn a_replay_writes_a_report_and_prints_its_path() {
     let installation = Installation::new("page", "cat report");
     let page = installation.0.join("report.html");
     let output = installation.replay(&[]);
-    assert!(
-        text(&output.stdout).ends_with(&format!("  report: {}\n", page.display())),
-        "{}",
-        text(&output.stdout)
-    );
+    let stdout = text(&output.stdout);
+    assert!(stdout.ends_with(&format!("  report: {}\n", page.display())), "{stdout}");
     assert!(fs::read_to_string(&page).unwrap().contains(r#""labels":["seen"]"#));
     fs::remove_file(&page).unwrap();
     installation.replay(&["--json"]);
@@ -189,11 +186,8 @@ fn an_exit_code_without_an_error_message_is_not_trusted() {
         let ended = format!(
             "error: gleaner-runtime ended without a result (exit status: {code})\n  help:  code of a lambda "
         );
-        assert!(
-            text(&output.stderr).starts_with(&format!("{stderr}{ended}")),
-            "{}",
-            text(&output.stderr)
-        );
+        let whole = text(&output.stderr);
+        assert!(whole.starts_with(&format!("{stderr}{ended}")), "{whole}");
     }
 }
 
@@ -201,11 +195,8 @@ fn an_exit_code_without_an_error_message_is_not_trusted() {
 fn a_crash_names_its_signal() {
     let output = Installation::new("crash", "kill -11 $$").replay(&[]);
     assert_eq!(output.status.code(), Some(1));
-    assert!(
-        text(&output.stderr).contains("without a result (signal: 11 (SIGSEGV)"),
-        "{}",
-        text(&output.stderr)
-    );
+    let stderr = text(&output.stderr);
+    assert!(stderr.contains("without a result (signal: 11 (SIGSEGV)"), "{stderr}");
 }
 
 /// Runs `gleaner` with these arguments; `OUT` stands for the folder of `installation`.

@@ -2,7 +2,6 @@
 
 use std::fs::{self, File};
 use std::io::{self, Write};
-use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
@@ -29,41 +28,7 @@ struct Args {
 #[derive(Subcommand, Debug)]
 enum CloudCommand {
     /// Serve people and vehicles until SIGTERM
-    Serve {
-        /// Folder of everything that survives a restart
-        #[arg(long, value_name = "DIR")]
-        data: PathBuf,
-        #[command(flatten)]
-        store: StoreArgs,
-        /// NATS server by which several processes over one database wake each other, as
-        /// nats://HOST:PORT, with NATS_USER and NATS_PASSWORD
-        #[arg(long, value_name = "URL")]
-        bus: Option<String>,
-        /// Bucket of an object store for files, as s3://BUCKET/PREFIX, with AWS_ACCESS_KEY_ID,
-        /// AWS_SECRET_ACCESS_KEY and AWS_ENDPOINT_URL; with it, several processes can serve one
-        /// database [default: the folder]
-        #[arg(long, value_name = "URL")]
-        objects: Option<String>,
-        /// Address of the API and the page for people, without TLS
-        #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:8080")]
-        people: SocketAddr,
-        /// Address for vehicles, with TLS
-        #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:8443")]
-        vehicles: SocketAddr,
-        /// Address for vehicles as enrolments state it, if it differs from --vehicles
-        #[arg(long, value_name = "HOST:PORT")]
-        name: Option<String>,
-        /// Days for which records of vehicles are kept, unless there are too many; 0 for any time
-        #[arg(long, value_name = "DAYS", default_value_t = 30)]
-        keep_records: u32,
-        /// Serve people without TLS also at an address that other machines can reach
-        #[arg(long)]
-        insecure_people: bool,
-        /// Count the limits of people by the last address in the header X-Forwarded-For, which a
-        /// proxy on this machine has to add to each request
-        #[arg(long)]
-        behind_proxy: bool,
-    },
+    Serve(ServeOptions),
     /// Print a one-time code for a user; a server may run meanwhile
     Invite {
         /// Name of the user
@@ -74,8 +39,10 @@ enum CloudCommand {
         /// Folder of the server
         #[arg(long, value_name = "DIR")]
         data: PathBuf,
-        #[command(flatten)]
-        store: StoreArgs,
+        /// Database of a PostgreSQL server, as postgres://USER@HOST/DATABASE, with the password in
+        /// PGPASSWORD [default: a file in the folder]
+        #[arg(long, value_name = "URL")]
+        store: Option<String>,
     },
     /// Write a copy of the database; a server may run meanwhile
     Backup {
@@ -85,15 +52,6 @@ enum CloudCommand {
         #[arg(long, value_name = "DIR")]
         data: PathBuf,
     },
-}
-
-/// The database.
-#[derive(clap::Args, Debug)]
-struct StoreArgs {
-    /// Database of a PostgreSQL server, as postgres://USER@HOST/DATABASE, with the password in
-    /// PGPASSWORD [default: a file in the folder]
-    #[arg(long, value_name = "URL")]
-    store: Option<String>,
 }
 
 /// Runs the program.
@@ -120,34 +78,9 @@ fn run(command: CloudCommand) -> Result<(), Failure> {
         .map_err(|error| Failure::caused_by(Exit::Internal, "cannot start threads", &error))?;
     let done = runtime.block_on(async {
         match command {
-            CloudCommand::Serve {
-                data,
-                store: StoreArgs { store },
-                bus,
-                objects,
-                people,
-                vehicles,
-                name,
-                keep_records: keep_records_days,
-                insecure_people: is_insecure,
-                behind_proxy: is_behind_proxy,
-            } => {
-                serve(ServeOptions {
-                    data,
-                    store,
-                    bus,
-                    objects,
-                    people,
-                    vehicles,
-                    name,
-                    keep_records_days,
-                    is_insecure,
-                    is_behind_proxy,
-                })
-                .await
-            }
+            CloudCommand::Serve(options) => serve(options).await,
             CloudCommand::Invite { name, role, data, store } => {
-                invite(NewUser { name, role }, &data, store.store.as_deref()).await
+                invite(NewUser { name, role }, &data, store.as_deref()).await
             }
             CloudCommand::Backup { file, data } => backup(&file, &data).await,
         }

@@ -41,29 +41,43 @@ const WAVES_INTERVAL: Duration = Duration::from_secs(2);
 /// Interval at which the server's certificate is made again.
 const CERTIFICATE_INTERVAL: Duration = Duration::from_secs(30 * 86_400);
 
-/// Settings of the server.
-#[derive(Debug, Clone)]
+/// Settings of the server, which are the arguments of `gleaner-cloud serve`.
+#[derive(clap::Args, Debug, Clone)]
 pub struct ServeOptions {
-    /// Folder of everything that survives a restart.
+    /// Folder of everything that survives a restart
+    #[arg(long, value_name = "DIR")]
     pub data: PathBuf,
-    /// URL of a PostgreSQL server with the database; without one, it is a file in the folder.
+    /// Database of a PostgreSQL server, as postgres://USER@HOST/DATABASE, with the password in
+    /// PGPASSWORD [default: a file in the folder]
+    #[arg(long, value_name = "URL")]
     pub store: Option<String>,
-    /// URL of a NATS server by which replicas wake each other.
+    /// NATS server by which several processes over one database wake each other, as
+    /// nats://HOST:PORT, with NATS_USER and NATS_PASSWORD
+    #[arg(long, value_name = "URL")]
     pub bus: Option<String>,
-    /// Place of files that replicas share, `s3://BUCKET/PREFIX`; without one, they are in the
-    /// folder and this process is the only one.
+    /// Bucket of an object store for files, as s3://BUCKET/PREFIX, with AWS_ACCESS_KEY_ID,
+    /// AWS_SECRET_ACCESS_KEY and AWS_ENDPOINT_URL; with it, several processes can serve one
+    /// database [default: the folder]
+    #[arg(long, value_name = "URL")]
     pub objects: Option<String>,
-    /// Address of the API for people.
+    /// Address of the API and the page for people, without TLS
+    #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:8080")]
     pub people: SocketAddr,
-    /// Address for vehicles.
+    /// Address for vehicles, with TLS
+    #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:8443")]
     pub vehicles: SocketAddr,
-    /// Address for vehicles as enrolments state it, `HOST:PORT`; without one, `vehicles`.
+    /// Address for vehicles as enrolments state it, if it differs from --vehicles
+    #[arg(long, value_name = "HOST:PORT")]
     pub name: Option<String>,
-    /// Days for which records are kept at least; 0 is without an end.
+    /// Days for which records of vehicles are kept, unless there are too many; 0 for any time
+    #[arg(long = "keep-records", value_name = "DAYS", default_value_t = 30)]
     pub keep_records_days: u32,
-    /// Permission to serve people, without TLS, at an address that other machines can reach.
+    /// Serve people without TLS also at an address that other machines can reach
+    #[arg(long = "insecure-people")]
     pub is_insecure: bool,
-    /// True if a proxy on this machine sends the requests of people, with their addresses.
+    /// Count the limits of people by the last address in the header X-Forwarded-For, which a
+    /// proxy on this machine has to add to each request
+    #[arg(long = "behind-proxy")]
     pub is_behind_proxy: bool,
 }
 

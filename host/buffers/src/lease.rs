@@ -60,14 +60,8 @@ impl<M> Draft<M> {
         unsafe { Lease::new(slots, index) }
     }
 
-    /// Seals the sample for a ring, which takes over the one hold on the slot of the returned
-    /// index.
-    pub(crate) fn into_hold(self, stamp: RingStamp, meta: M) -> u32 {
-        self.sealed(Some(stamp), meta).1
-    }
-
-    /// Raises the count to 1; the caller owns that hold.
-    fn sealed(self, stamp: Option<RingStamp>, meta: M) -> (Arc<Slots<M>>, u32) {
+    /// Raises the count of the slot of the returned index to 1; the caller owns that hold.
+    pub(crate) fn sealed(self, stamp: Option<RingStamp>, meta: M) -> (Arc<Slots<M>>, u32) {
         let draft = ManuallyDrop::new(self);
         let (index, len) = (draft.index, draft.len);
         // SAFETY: moves the field out of a draft that is never dropped.

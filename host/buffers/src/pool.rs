@@ -265,7 +265,7 @@ impl<M> Pool<M> {
         (found == Some(stamp)).then_some(hold)
     }
 
-    /// Releases a hold that [`Draft::into_hold`] has left.
+    /// Releases a hold that [`Draft::sealed`] has left.
     ///
     /// # Safety
     ///

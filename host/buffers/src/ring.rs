@@ -302,7 +302,7 @@ impl<M> RingWriter<M> {
         }
         let position = self.head;
         let stamp = RingStamp { ring: ring.id, position };
-        let index = draft.into_hold(stamp, meta);
+        let index = draft.sealed(Some(stamp), meta).1;
         // The spare place: its last sample left when `position - 1` was published. Release pairs
         // with `at`: a reader that looks for that sample and finds this one also sees the `head` of
         // that time.

@@ -13,7 +13,7 @@ const MOST_STALLED: u32 = 10;
 const SPACING: Duration = Duration::from_millis(900);
 
 /// Checks, about once a second, that a participant works.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(super) struct Watchdog {
     sockets: Sockets,
     threads: HashSet<u32>,
@@ -33,17 +33,7 @@ pub(super) struct Watchdog {
 
 impl Watchdog {
     pub(super) fn new(sockets: Sockets, threads: HashSet<u32>) -> Self {
-        Self {
-            sockets,
-            threads,
-            checked: None,
-            queues: Queues::default(),
-            handled: 0,
-            busy: 0,
-            waiting: 0,
-            delivery: None,
-            delivering: 0,
-        }
+        Self { sockets, threads, ..Self::default() }
     }
 
     /// Returns the state of the sockets' queues, and why the participant is dead, if it is.

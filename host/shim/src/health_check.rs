@@ -26,6 +26,7 @@ const MAX_THREADS: u64 = 512;
 const UNCOUNTED: u64 = 64 << 20;
 
 /// State of the checks of one process.
+#[derive(Default)]
 pub(crate) struct HealthCheck {
     pid: u32,
     /// `None` while it cannot be opened, for example as the system has too many open files.
@@ -38,13 +39,7 @@ pub(crate) struct HealthCheck {
 impl HealthCheck {
     /// Begins the checks of process `pid`.
     pub(crate) fn of(pid: u32) -> Self {
-        Self {
-            pid,
-            status: None,
-            late: Sustained::default(),
-            stopped: Sustained::default(),
-            excess: Sustained::default(),
-        }
+        Self { pid, ..Self::default() }
     }
 
     /// Returns the reason to kill the runtime, or the time until the next check.

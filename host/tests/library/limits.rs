@@ -25,11 +25,8 @@ fn a_guest_that_keeps_handles_is_stopped_and_the_next_one_starts_with_none() {
         let first = test.fault();
         assert_eq!(first.kind, FaultKind::HostCall, "{behaviour}: {first:?}");
         let allowed = Limits::DEFAULT.handles;
-        assert!(
-            first.message.contains(&format!("{allowed} handles")),
-            "{behaviour}: {}",
-            first.message
-        );
+        let message = &first.message;
+        assert!(message.contains(&format!("{allowed} handles")), "{behaviour}: {message}");
         assert_eq!((first.used, first.allowed), (Some(allowed + 1), Some(allowed)), "{behaviour}");
         // The guest released its handles, so the second one reaches the same number.
         assert!(Arc::strong_count(&test.topic) < owners, "{behaviour}");
@@ -131,11 +128,8 @@ fn a_component_that_starts_with_more_memory_than_it_may_have_does_not_start() {
         (fault.kind, fault.used, fault.allowed),
         (FaultKind::Memory, Some(400 * PAGE), Some(MEMORY))
     );
-    assert!(
-        fault.message.starts_with("in init: asked for 25.0 MiB; `memory` in [limits]"),
-        "{}",
-        fault.message
-    );
+    let message = &fault.message;
+    assert!(message.starts_with("in init: asked for 25.0 MiB; `memory` in [limits]"), "{message}");
 }
 
 #[test]

@@ -13,18 +13,14 @@ use gleaner_host::guest::{Guest, WakeOutcome};
 use gleaner_host::input::open_inputs;
 use gleaner_lambda::FaultKind;
 use gleaner_lambda::manifest::{ConfigValue, Limits, Manifest};
-use gleaner_tests::root;
+use gleaner_tests::{root, with_header};
 use gleaner_transport::loopback::Loopback;
 
 use crate::meta;
 
 const FUEL: u64 = 5_000_000;
 const MEMORY: u64 = 16 << 20;
-const IMU: &str = "std_msgs/Header header\nfloat64 x\n\
-================================================================================\n\
-MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n\
-================================================================================\n\
-MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n";
+const IMU: &str = with_header!("std_msgs/Header header\nfloat64 x\n");
 
 /// A misbehaving lambda and the transport that feeds it.
 struct MisbehavingGuest {
@@ -207,11 +203,8 @@ fn a_refusal_in_init_ends_the_start() {
     }
     let fault = MisbehavingGuest::new("panic_in_init", FUEL, None).guest.init().unwrap_err();
     assert_eq!(fault.kind, FaultKind::Trap);
-    assert!(
-        fault.message.starts_with("in init: ") && fault.message.contains("no, not today"),
-        "{}",
-        fault.message
-    );
+    let message = &fault.message;
+    assert!(message.starts_with("in init: ") && message.contains("no, not today"), "{message}");
 }
 
 #[test]

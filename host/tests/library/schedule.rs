@@ -9,21 +9,13 @@ use gleaner_host::api::data::{Sample, Topic, Wake};
 use gleaner_host::input::open_inputs;
 use gleaner_host::schedule::WakeSchedule;
 use gleaner_lambda::manifest::Manifest;
+use gleaner_tests::drive::TICKER_IMU;
 use gleaner_tests::root;
 use gleaner_transport::loopback::Loopback;
 
 use crate::meta;
 
 const MS: i64 = 1_000_000;
-
-/// The part of `sensor_msgs/msg/Imu` that `ticker` reads.
-const IMU: &str = "std_msgs/Header header\ngeometry_msgs/Vector3 linear_acceleration\n\
-================================================================================\n\
-MSG: geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n\
-================================================================================\n\
-MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n\
-================================================================================\n\
-MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n";
 
 /// An event input, and the transport that feeds it.
 struct EventFeed {
@@ -44,7 +36,7 @@ impl EventFeed {
         );
         let manifest = Manifest::parse(&manifest, "lambda.toml").unwrap();
         let mut transport = Loopback::new();
-        transport.add_topic("/imu/data", "sensor_msgs/msg/Imu", IMU);
+        transport.add_topic("/imu/data", "sensor_msgs/msg/Imu", TICKER_IMU);
         let inputs = open_inputs(&manifest, &[], &mut transport).unwrap();
         Self {
             transport,

@@ -398,11 +398,6 @@ impl Core {
         }
     }
 
-    /// Notes that the supervisor cannot be reached.
-    pub(crate) fn lost_supervisor(&self) {
-        self.lock().status = None;
-    }
-
     /// Writes the state as it is, with the next generation, and publishes what is wanted.
     pub(crate) fn save(&self, inner: &mut Inner) -> Result<(), Failure> {
         let state = inner.state.clone();

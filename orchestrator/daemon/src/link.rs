@@ -82,7 +82,7 @@ impl SupervisorLink {
                 Ok(stream) => self.serve(stream).await,
                 Err(failure) => LinkEnd::Lost(failure.to_string()),
             };
-            self.core.lost_supervisor();
+            self.core.lock().status = None;
             silent = if matches!(end, LinkEnd::Silent) { silent + 1 } else { 0 };
             if silent == 0 && connected.elapsed() >= STAYS {
                 (is_failing, pause) = (false, PAUSE);

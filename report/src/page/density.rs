@@ -27,11 +27,13 @@ pub(crate) struct DensityBin {
     pub(crate) count: u64,
 }
 
-impl Density {
-    pub(super) fn new() -> Self {
+impl Default for Density {
+    fn default() -> Self {
         Self { shift: FIRST_SHIFT, bins: BTreeMap::new() }
     }
+}
 
+impl Density {
     /// Counts an event in `lane`, `after_ns` after the start.
     pub(super) fn add(&mut self, lane: usize, after_ns: i64) {
         *self.bins.entry((lane, after_ns >> self.shift)).or_default() += 1;
@@ -63,7 +65,7 @@ mod tests {
 
     #[test]
     fn a_million_events_are_counted_in_few_bins() {
-        let mut density = Density::new();
+        let mut density = Density::default();
         for event in 0..1_000_000_i64 {
             density.add((event % 3) as usize, event * 10_000_000);
         }
@@ -76,7 +78,7 @@ mod tests {
 
     #[test]
     fn times_at_the_ends_of_the_range_are_counted() {
-        let mut density = Density::new();
+        let mut density = Density::default();
         for at in [i64::MIN, -1, 0, i64::MAX] {
             density.add(0, at);
         }

@@ -29,7 +29,7 @@ const MESSAGE_CHARS: usize = 2_000;
 const ATTRIBUTE_BYTES: usize = 2_048;
 
 /// Remaining bytes for texts on the page. Escaped texts may take six times their size in the file.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 pub(super) struct TextBudget(pub(super) usize);
 
 impl TextBudget {
@@ -57,6 +57,7 @@ impl TextBudget {
 }
 
 /// The collected triggers and faults.
+#[derive(Default)]
 pub(super) struct Events {
     start_ns: i64,
     pub(super) labels: Vec<String>,
@@ -81,20 +82,9 @@ impl Events {
     pub(super) fn new(start_ns: i64, budget: usize) -> Self {
         Self {
             start_ns,
-            labels: Vec::new(),
-            label_numbers: HashMap::new(),
-            triggers: Vec::new(),
-            trigger_density: Density::new(),
-            fault_kinds: Vec::new(),
-            faults: Vec::new(),
-            fault_density: Density::new(),
-            causes: Vec::new(),
-            cause_numbers: HashMap::new(),
-            triggers_seen: 0,
-            faults_seen: 0,
-            unlisted_faults: 0,
             trigger_budget: TextBudget(budget),
             fault_budget: TextBudget(budget / 2),
+            ..Self::default()
         }
     }
 

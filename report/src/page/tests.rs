@@ -348,11 +348,8 @@ fn names_values_and_lists_have_bounds_too() {
     signals["config"] = json!({});
     other.write("signals.json", signals.to_string());
     let diff = Diff::between(out.path(), other.path()).unwrap();
-    assert!(
-        diff.notes.iter().any(|note| note == "50 more config values differ"),
-        "{:?}",
-        diff.notes
-    );
+    let notes = &diff.notes;
+    assert!(notes.iter().any(|note| note == "50 more config values differ"), "{notes:?}");
     let bytes = ReportPage::of_both(out.path(), other.path(), diff).unwrap().to_html().len();
     assert!(bytes < 8 << 20, "{bytes}");
 }

@@ -76,8 +76,7 @@ fn recorded(
         JsonReport::Recorder(RecorderReport::Status(status)) if wanted(&status) => Some(*status),
         _ => None,
     });
-    started.signal("INT");
-    let finished = started.finish();
+    let finished = started.interrupt();
     let summary: LiveStatus = serde_json::from_slice(&fs::read(out.join("summary.json"))?)?;
     let of_recorder = summary
         .recording

@@ -84,8 +84,7 @@ fn memory_is_mapped() -> Result<(), Failed> {
         sleep(Duration::from_millis(20));
     }
     assert!(mapped() < 320, "{} MiB", mapped());
-    running.signal("INT");
-    let finished = running.finish();
+    let finished = running.interrupt();
     assert!(finished.status.success(), "{}", finished.stderr);
     Ok(())
 }
@@ -135,8 +134,7 @@ fn doctor_permits(mut gleaner: Command) -> bool {
 /// There were `warnings` that it is refused.
 fn until_end(running: RunningProgram, warnings: usize) -> bool {
     running.until_live("a status of the network", |live| live.network.buffer_granted > 0);
-    running.signal("INT");
-    let finished = running.finish();
+    let finished = running.interrupt();
     assert!(finished.status.success(), "{}", finished.stderr);
     let refused = finished.stderr.matches("refuses real-time priority").count();
     assert_eq!(refused, warnings, "{}", finished.stderr);

@@ -216,8 +216,7 @@ fn run_until_samples(lambdas: &[&Path]) -> Result<(), Failed> {
         }
         (receiving.len() == lambdas.len()).then_some(())
     });
-    run.signal("INT");
-    let finished = run.finish();
+    let finished = run.interrupt();
     match finished.status.success() {
         true => Ok(()),
         false => Err(format!("{}: {}", finished.status, finished.stderr).into()),

@@ -30,8 +30,7 @@ pub fn every_wake() {
         let out = TempFolder::new();
         let started = run(lambda.path(), out.path(), &["--no-record", "--all"]);
         started.until_live("some thousand wakes", |live| live.wakes >= 3000);
-        started.signal("INT");
-        let finished = started.finish();
+        let finished = started.interrupt();
         let (ended, written) = (finished.ended(), decisions(out.path()));
         assert_eq!(
             (written.len() as u64, ended.unwritten),
@@ -70,8 +69,7 @@ pub fn killed_at_once() {
         "{reported:?}, written {written:?}"
     );
     started.until_live("the next process", |live| live.restarts == 1);
-    started.signal("INT");
-    let finished = started.finish();
+    let finished = started.interrupt();
     assert!(finished.stderr.contains("was ended by signal 9"), "{}", finished.stderr);
     // The killed process could not count its last wake.
     assert_eq!(summary(out.path()).faults, finished.ended().faults + 1);
@@ -105,8 +103,7 @@ pub fn stopped() {
     );
     writing.signal("INT");
     assert!(writing.finish().ended().unsent >= to.unsent);
-    reading.signal("INT");
-    reading.finish();
+    reading.interrupt();
 }
 
 pub fn no_writer() {
@@ -114,10 +111,7 @@ pub fn no_writer() {
     let started = run(&lambda("examples/hello", "rust"), out.path(), &["--for", "5"]);
     let finished = started.finish();
     assert!(finished.status.success(), "{}", finished.stderr);
-    assert!(
-        finished.stderr.contains("no writer of `/imu/data` (sensor_msgs/msg/Imu) yet"),
-        "{}",
-        finished.stderr
-    );
+    let stderr = &finished.stderr;
+    assert!(stderr.contains("no writer of `/imu/data` (sensor_msgs/msg/Imu) yet"), "{stderr}");
     assert_eq!(finished.ended().topics[0].received, 0);
 }

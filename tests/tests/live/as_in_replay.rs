@@ -115,8 +115,7 @@ fn played(
         }
         (over.len() == TWINS.len()).then_some(())
     });
-    started.signal("INT");
-    let finished = started.finish();
+    let finished = started.interrupt();
     assert!(finished.status.success(), "{}, {}", finished.status, finished.stderr);
     for clip in clips(out.path()) {
         let file = out.path().join(&clip.file);

@@ -67,8 +67,7 @@ fn run_once(kills: &Kills, random: &mut XorShift64, totals: &mut ChaosCounts) {
     all_receive(&started, false);
     kill_some(&started, &lambdas, kills, random, totals);
     all_receive(&started, true);
-    player.signal("INT");
-    let sent = player.finish().sent()["/imu/synthetic"];
+    let sent = player.interrupt().sent()["/imu/synthetic"];
     // The last sample is received, too. A lambda that was started again lacks earlier ones.
     started.until_named("the end of the samples", |name, report| match report {
         Report::Live(live) if name == "last" => {
@@ -78,8 +77,7 @@ fn run_once(kills: &Kills, random: &mut XorShift64, totals: &mut ChaosCounts) {
         }
         _ => None,
     });
-    started.signal("INT");
-    let finished = started.finish();
+    let finished = started.interrupt();
     // A process has failed, or that of a lambda.
     let exit = finished.status.code();
     assert!(matches!(exit, Some(1 | 6)), "{exit:?}: {}", finished.stderr);

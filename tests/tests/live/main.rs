@@ -143,19 +143,15 @@ fn slow_round(behaviour: &str) -> bool {
             let now = (topic.received, topic.no_slot, topic.lost);
             is_over && before.replace(now) == Some(now)
         });
-        started.signal("INT");
-        let finished = started.finish();
+        let finished = started.interrupt();
         let ended = finished.ended();
         let topic = &ended.topics[0];
         let stale =
             decisions(out.path()).iter().filter(|decision| !decision.triggers.is_empty()).count()
                 as u64;
         // Two may arrive between selection and check if the machine stalls in between.
-        assert!(
-            10 * stale <= ended.wakes + 10,
-            "{stale} of {} wakes were not for the newest frame",
-            ended.wakes
-        );
+        let wakes = ended.wakes;
+        assert!(10 * stale <= wakes + 10, "{stale} of {wakes} wakes were not for the newest frame");
         if behaviour == "sleep" {
             assert_eq!(ended.faults, 0, "{}", finished.stderr);
             assert_eq!(ended.wakes + topic.skipped, topic.received, "{topic:?}");
@@ -190,17 +186,13 @@ fn ctrl_c() {
         JsonReport::Recorder(RecorderReport::Status(status)) if status.is_recording => Some(()),
         _ => None,
     });
-    started.signal("INT");
-    let finished = started.finish();
+    let finished = started.interrupt();
     drop(player);
     assert!(finished.status.success(), "{}", finished.stderr);
     let clips = clips(out.path());
     assert_eq!(clips.len(), 1);
-    assert!(
-        clips[0].incomplete.iter().any(|why| why.contains("stopped")),
-        "{:?}",
-        clips[0].incomplete
-    );
+    let incomplete = &clips[0].incomplete;
+    assert!(incomplete.iter().any(|why| why.contains("stopped")), "{incomplete:?}");
     assert!(clips[0].topics.iter().all(|topic| topic.messages > 0), "{:?}", clips[0].topics);
     assert!(out.path().join("summary.json").is_file());
 }
@@ -234,8 +226,7 @@ fn shared() {
         let is_over = received[0] == received[1] && received[0] > 0 && writers == [Some(0); 2];
         is_over.then_some(())
     });
-    started.signal("INT");
-    let finished = started.finish();
+    let finished = started.interrupt();
     assert!(finished.status.success(), "{}: {}", finished.status, finished.stderr);
     let imu = [0, 1].map(|index| {
         let name = ["first", "second"][index];
@@ -293,8 +284,7 @@ fn killed(name: &str) {
         });
         "restarting in 1 s (restart 1)"
     };
-    started.signal("INT");
-    let finished = started.finish();
+    let finished = started.interrupt();
     drop(player);
     assert!(finished.stderr.contains(restart), "{}", finished.stderr);
     // Reported decisions are in the file.
@@ -341,8 +331,7 @@ fn ingress_killed() {
     });
     assert_eq!(readers(), before, "they run on");
     drop(player);
-    started.signal("INT");
-    let finished = started.finish();
+    let finished = started.interrupt();
     let reason =
         "the ingress ended unexpectedly (signal: 9 (SIGKILL)); restarting in 0.1 s (restart 1)";
     assert!(finished.stderr.contains(reason), "{}", finished.stderr);

@@ -47,11 +47,8 @@ fn a_journal_that_another_process_writes_is_refused_and_unchanged() {
         busy.must_exit(1);
         let expected =
             format!("another process writes or verifies journal `{}`", journal.display());
-        assert!(
-            busy.stderr.contains(&expected) && busy.stderr.contains("--journal FILE"),
-            "{}",
-            busy.stderr
-        );
+        let stderr = &busy.stderr;
+        assert!(stderr.contains(&expected) && stderr.contains("--journal FILE"), "{stderr}");
         // The earlier results are complete.
         assert_eq!(
             (busy.decisions.len(), busy.clips.len()),
@@ -185,11 +182,8 @@ fn a_journal_that_begins_in_the_middle_is_refused() {
         out.write("forged.journal", with_header(&journal, |header| header.wakes_before = 7));
     let again = verify_drive(&hello(), &forged, &[]);
     assert_eq!(again.exit, 4, "{}", again.stderr);
-    assert!(
-        again.stderr.contains("wakes before the first one") && again.stderr.contains('7'),
-        "{}",
-        again.stderr
-    );
+    let stderr = &again.stderr;
+    assert!(stderr.contains("wakes before the first one") && stderr.contains('7'), "{stderr}");
 }
 
 /// Kills a replay after it has listed a clip.
@@ -226,13 +220,10 @@ fn moments_of_listed_clips_are_in_decisions_and_journal_after_a_kill() {
             wakes.push(entry.at_ns);
         }
         for moment in clips.iter().flat_map(|clip| &clip.moments) {
-            let is_decided = decisions.iter().any(|decision| decision.at_ns == moment.at_ns);
-            assert!(is_decided, "attempt {attempt}: no decision at {} ns", moment.at_ns);
-            assert!(
-                wakes.contains(&moment.at_ns),
-                "attempt {attempt}: no wake at {} ns",
-                moment.at_ns
-            );
+            let at_ns = moment.at_ns;
+            let is_decided = decisions.iter().any(|decision| decision.at_ns == at_ns);
+            assert!(is_decided, "attempt {attempt}: no decision at {at_ns} ns");
+            assert!(wakes.contains(&at_ns), "attempt {attempt}: no wake at {at_ns} ns");
         }
         hits += usize::from(!clips.is_empty() && clips.len() < events.len());
     }

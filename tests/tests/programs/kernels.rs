@@ -1,13 +1,9 @@
 //! Kernels of the SDK compute the same in a component as natively.
 
 use gleaner_tests::drive::{CdrBuilder, one_topic};
-use gleaner_tests::{TempFolder, replay, root};
+use gleaner_tests::{TempFolder, replay, root, with_header};
 
-const IMU: &str = "std_msgs/Header header\n\
-================================================================================\n\
-MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n\
-================================================================================\n\
-MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n";
+const IMU: &str = with_header!("std_msgs/Header header\n");
 
 #[test]
 fn a_component_computes_the_same_as_native_code() {

@@ -59,11 +59,8 @@ fn a_python_lambda_over_its_memory_limit_faults_with_both_numbers_and_is_re_init
         );
         let used = fault.used.expect("the amount is known");
         assert!((ALLOWED..AT_MOST).contains(&used), "{}", fault.message);
-        assert!(
-            fault.message.ends_with("`memory` in [limits] allows 32.0 MiB"),
-            "{}",
-            fault.message
-        );
+        let message = &fault.message;
+        assert!(message.ends_with("`memory` in [limits] allows 32.0 MiB"), "{message}");
     }
     let summary = run.summary.as_ref().expect("a summary");
     assert_eq!(summary.backed_off, 0, "some wakes between the faults succeeded");

@@ -185,8 +185,7 @@ fn ctrl_c_during_a_drive_ends_all_lambdas_with_their_results() {
     let out = TempFolder::new();
     let started = start(&[&first, &second], &out, &[]);
     until_it_plays(&started, "second");
-    started.signal("INT");
-    let finished = started.finish();
+    let finished = started.interrupt();
     assert!(finished.status.success(), "{}: {}", finished.status, finished.stderr);
     for name in ["first", "second"] {
         let ended = finished.ended_of(name).unwrap();

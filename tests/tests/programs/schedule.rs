@@ -4,20 +4,11 @@
 use std::path::PathBuf;
 
 use gleaner_lambda::{Cause, Decision, twins_differ};
-use gleaner_tests::drive::{CdrBuilder, one_topic};
+use gleaner_tests::drive::{CdrBuilder, TICKER_IMU, one_topic};
 use gleaner_tests::{ReplayRun, TempFolder, replay, root, sample_drive};
 
 const MS: i64 = 1_000_000;
 const PERIOD: i64 = 100 * MS;
-
-/// The fields of `sensor_msgs/msg/Imu` that `ticker` reads.
-const IMU: &str = "std_msgs/Header header\ngeometry_msgs/Vector3 linear_acceleration\n\
-================================================================================\n\
-MSG: geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n\
-================================================================================\n\
-MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n\
-================================================================================\n\
-MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n";
 
 /// Runs both twins of `ticker` over a drive; they must agree, also in attributes besides the score.
 fn tick(drive: PathBuf) -> ReplayRun {
@@ -63,7 +54,7 @@ fn all_ticks_of_a_gap_too_long_to_catch_up_are_counted_as_missed() {
         cdr.extend([0.5_f64, 0.0, 9.8].iter().flat_map(|value| value.to_le_bytes()));
         (at_ns as u64, cdr)
     });
-    let run = tick(one_topic(&folder, "/imu/data", "sensor_msgs/msg/Imu", IMU, &messages));
+    let run = tick(one_topic(&folder, "/imu/data", "sensor_msgs/msg/Imu", TICKER_IMU, &messages));
     let summary = run.summary.as_ref().unwrap();
     // From the tick at 1.0 s to the one at 30,000.0 s.
     let missed = (after - before) / PERIOD + 1;

@@ -49,16 +49,10 @@ fn a_replay_keeps_the_values_that_were_read_and_the_costs() {
             (4170, has_fuel.then_some(4170))
         );
         // Plausible durations of wakes; their sum is in the summary, too.
-        assert!(
-            signals.run_ns.p50 > 100 && signals.run_ns.max as f64 / 1e9 <= 1.02 * summary.run_s,
-            "{:?}",
-            signals.run_ns
-        );
-        assert!(
-            signals.fuel.as_ref().is_none_or(|fuel| fuel.p50 > 100 && fuel.p50 < fuel.max),
-            "{:?}",
-            signals.fuel
-        );
+        let run_ns = &signals.run_ns;
+        assert!(run_ns.p50 > 100 && run_ns.max as f64 / 1e9 <= 1.02 * summary.run_s, "{run_ns:?}");
+        let fuel = signals.fuel.as_ref();
+        assert!(fuel.is_none_or(|fuel| fuel.p50 > 100 && fuel.p50 < fuel.max), "{fuel:?}");
         assert_eq!(
             signals.config["brake_mps2"],
             gleaner_lambda::manifest::ConfigValue::Float(-1.4)

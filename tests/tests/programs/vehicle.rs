@@ -43,11 +43,8 @@ fn the_lower_limit_applies_and_is_named() {
     let run = on(&folder, &lambda, "[limits]\nfuel = 1_000\nmemory = \"1 GiB\"\n", &[]);
     let (_, message) = run.must_exit(FAULTED).first_fault().expect("a fault");
     assert!(message.contains("[limits] allows 1,000:"), "{message}");
-    assert!(
-        run.stderr.contains("fuel 10000000 -> 1000") && !run.stderr.contains("memory"),
-        "{}",
-        run.stderr
-    );
+    let stderr = &run.stderr;
+    assert!(stderr.contains("fuel 10000000 -> 1000") && !stderr.contains("memory"), "{stderr}");
     let run = on(&folder, &lambda, "[limits]\nfuel = 100_000_000\n", &BRAKING);
     assert!(run.must_exit(OK).stderr.is_empty(), "{}", run.stderr);
 }
@@ -89,11 +86,8 @@ fn a_journal_is_verified_under_the_limits_that_it_records() {
         manifest.replace("fuel = 10_000_000", "fuel = 50_000")
     });
     let poor = again(&folder, poor.path(), None);
-    assert!(
-        poor.exit == DIFFERS && poor.stderr.contains("now:            50000"),
-        "{}",
-        poor.stderr
-    );
+    let stderr = &poor.stderr;
+    assert!(poor.exit == DIFFERS && stderr.contains("now:            50000"), "{stderr}");
 }
 
 #[test]

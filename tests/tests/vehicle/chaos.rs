@@ -80,8 +80,7 @@ pub fn killed_at_random() {
         }
     }
     if let Some(player) = player {
-        player.signal("INT");
-        player.finish();
+        player.interrupt();
     }
     for (victim, times) in &mut recoveries {
         times.sort();

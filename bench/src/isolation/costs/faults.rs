@@ -103,7 +103,6 @@ fn live(faults: u64) -> [Vec<Decision>; 2] {
     let drive = drive.to_str().expect("a plain name");
     let started = run_all(&folders, out.path(), &["--no-record", "--all", "--drive", drive]);
     until_all(&started, "faults by deadlines", LIVE.len(), |live| live.faults > faults);
-    started.signal("INT");
-    started.finish();
+    started.interrupt();
     LIVE.map(|(_, twin)| decisions(&out.path().join(twin.folder())))
 }

@@ -143,16 +143,14 @@ impl LiveKind {
         if let ([lambda], 1) = (&processes.lambdas[..], count) {
             self.killed_s.push(until_replaced(*lambda, &started));
         }
-        started.signal("INT");
-        started.finish();
+        started.interrupt();
     }
 
     fn run_camera(&mut self, kind: Twin, drive: &Path) {
         let out = TempFolder::new();
         let started = run_on(drive, &[Workload::Brake1080.lambda(kind)], &out);
         self.camera_cpu_us.extend(cpu_per_wake(&started, FRAMES));
-        started.signal("INT");
-        started.finish();
+        started.interrupt();
     }
 
     fn memory_of(&self, count: usize) -> f64 {

@@ -168,13 +168,11 @@ pub(super) async fn invite(
     Extension(user): Extension<PageUser>,
     Extension(fields): Extension<FormFields>,
 ) -> PageResult {
-    let new =
-        fields.role().map(|role| NewUser { name: fields.get("name").trim().to_owned(), role });
-    let invited = match new {
-        Ok(new) => cloud.store.invite(&user.user.name, new).await,
-        Err(error) => Err(error),
+    let invited = async {
+        let new = NewUser { name: fields.get("name").trim().to_owned(), role: fields.role()? };
+        cloud.store.invite(&user.user.name, new).await
     };
-    let invitation = match invited {
+    let invitation = match invited.await {
         Ok(invitation) => invitation,
         Err(error) => return refused(&cloud, &user, error).await,
     };

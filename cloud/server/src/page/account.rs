@@ -65,24 +65,26 @@ pub(super) async fn set_password(
     Extension(fields): Extension<FormFields>,
 ) -> PageResult {
     let new = fields.get("password");
-    let hash = match new == fields.get("again") {
-        true => match cloud.account_changes.count(&user.user.name) {
-            Ok(()) => password::hashed(new.to_owned()).await,
-            Err(error) => Err(error),
-        },
-        false => Err(CloudError::usage("the two passwords differ", "type the same one twice")),
+    let hash = async {
+        if new != fields.get("again") {
+            return Err(CloudError::usage("the two passwords differ", "type the same one twice"));
+        }
+        cloud.account_changes.count(&user.user.name)?;
+        password::hashed(new.to_owned()).await
     };
-    match hash {
+    match hash.await {
         Ok(hash) => {
             cloud.store.set_password(&user.user.name, &hash, user.session()).await?;
             Ok(Redirect::to("/account?done=password").into_response())
         }
-        Err(error) => {
-            let status = error.status();
-            let page = account_page(&cloud, &user, failure(error)).await?;
-            Ok(with_status(status, page))
-        }
+        Err(error) => refused(&cloud, &user, error).await,
     }
+}
+
+async fn refused(cloud: &Cloud, user: &PageUser, error: CloudError) -> PageResult {
+    let status = error.status();
+    let page = account_page(cloud, user, failure(error)).await?;
+    Ok(with_status(status, page))
 }
 
 fn tokens(user: &PageUser, all: &[TokenSummary]) -> Markup {
@@ -130,26 +132,18 @@ pub(super) async fn make_token(
     Extension(user): Extension<PageUser>,
     Extension(fields): Extension<FormFields>,
 ) -> PageResult {
-    let made = match fields.role() {
-        Ok(role) => {
-            let name = fields.get("name").trim().to_owned();
-            // No number is none that is allowed.
-            let days = fields.get("days").trim().parse().unwrap_or(0);
-            let new = NewToken { name, role, days };
-            match cloud.account_changes.count(&user.user.name) {
-                Ok(()) => cloud.store.make_token((&user.user, (&user.user).into()), new).await,
-                Err(error) => Err(error),
-            }
-        }
-        Err(error) => Err(error),
+    let made = async {
+        let role = fields.role()?;
+        let name = fields.get("name").trim().to_owned();
+        // No number is none that is allowed.
+        let days = fields.get("days").trim().parse().unwrap_or(0);
+        cloud.account_changes.count(&user.user.name)?;
+        let new = NewToken { name, role, days };
+        cloud.store.make_token((&user.user, (&user.user).into()), new).await
     };
-    let made = match made {
+    let made = match made.await {
         Ok(made) => made,
-        Err(error) => {
-            let status = error.status();
-            let page = account_page(&cloud, &user, failure(error)).await?;
-            return Ok(with_status(status, page));
-        }
+        Err(error) => return refused(&cloud, &user, error).await,
     };
     let body = html! {
         nav.crumbs aria-label="Path" { a href="/account" { "Account" } }

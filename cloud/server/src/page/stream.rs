@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use axum::extract::{Extension, Path, Query, State};
 use axum::http::HeaderMap;
+use axum::response::IntoResponse;
 use axum::response::sse::{Event, Sse};
-use axum::response::{IntoResponse, Response};
 use futures_util::stream::unfold;
 use maud::html;
 use serde::Deserialize;
@@ -83,12 +83,8 @@ fn follow(
     let tail = cloud.tails.read(&source.vehicle, &source.followed());
     let follower = RecordFollower { cloud, user, source, position, arrivals, slot, _tail: tail };
     let events = unfold(follower, RecordFollower::next);
-    Ok(without_buffers(Sse::new(events).into_response()))
-}
-
-/// Asks proxies not to keep events back.
-fn without_buffers(reply: Response) -> Response {
-    ([("x-accel-buffering", "no")], reply).into_response()
+    // Asks proxies not to keep events back.
+    Ok(([("x-accel-buffering", "no")], Sse::new(events)).into_response())
 }
 
 impl RecordFollower {

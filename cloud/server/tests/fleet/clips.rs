@@ -13,7 +13,7 @@ use tokio::io::AsyncWriteExt;
 use tokio::time::sleep;
 
 use crate::fake::{FakeVehicle, Person, soon};
-use crate::{options, start};
+use crate::{options, start, start_with_vehicle};
 
 /// Time between two looks at what changes soon: with more looks, the vehicle would be in a loop.
 const PAUSE: Duration = Duration::from_millis(250);
@@ -101,8 +101,7 @@ pub(crate) async fn bytes(person: &Person, path: &str) -> (StatusCode, Vec<u8>) 
 
 #[tokio::test]
 async fn announced_clips_are_listed_once_by_vehicle_lambda_label_and_time() {
-    let (folder, server, admin) = start().await;
-    let (vehicle, _) = admin.enrol("car-7").await;
+    let (folder, server, admin, vehicle) = start_with_vehicle().await;
     let (other, _) = admin.enrol("car-8").await;
     assert_eq!(orders(&vehicle).await, ClipOrders::default());
     let clips = [facts("a", "dark", 1000, b"a"), facts("b", "wet", 2000, b"b")];
@@ -139,8 +138,7 @@ async fn announced_clips_are_listed_once_by_vehicle_lambda_label_and_time() {
 
 #[tokio::test]
 async fn a_wanted_clip_comes_in_parts_across_an_interruption_and_a_restart() {
-    let (folder, server, admin) = start().await;
-    let (vehicle, _) = admin.enrol("car-7").await;
+    let (folder, server, admin, vehicle) = start_with_vehicle().await;
     let (mut link, ..) = vehicle.connect().await;
     let content = two_parts();
     let (first, second) = content.split_at(CLIP_PART as usize);
@@ -218,8 +216,7 @@ async fn a_wanted_clip_comes_in_parts_across_an_interruption_and_a_restart() {
 
 #[tokio::test]
 async fn an_announced_thumbnail_that_is_no_image_is_refused_once() {
-    let (_folder, server, admin) = start().await;
-    let (vehicle, _) = admin.enrol("car-7").await;
+    let (_folder, server, admin, vehicle) = start_with_vehicle().await;
     for (name, image) in [
         ("empty", &jpeg(0, 0)[..]),
         ("huge", &jpeg(65535, 65535)),
@@ -315,8 +312,7 @@ async fn hostile_uploads_are_refused_and_change_nothing() {
 
 #[tokio::test]
 async fn the_policy_the_budget_and_the_vehicle_decide_what_is_sent() {
-    let (_folder, server, admin) = start().await;
-    let (vehicle, _) = admin.enrol("car-7").await;
+    let (_folder, server, admin, vehicle) = start_with_vehicle().await;
     let mut best = facts("best", "dark", 3000, b"best");
     best["moments"][0]["score"] = json!(0.9);
     let clips = [facts("late", "dark", 2000, b"late"), facts("early", "dark", 1, b"early"), best];

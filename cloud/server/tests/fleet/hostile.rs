@@ -4,7 +4,7 @@ use gleaner_fleet::{Body, FRAME_MAX, Frame, Hello, LINES_MAX, Records, Reported,
 use hyper::{Method, StatusCode};
 use serde_json::Value;
 
-use crate::start;
+use crate::{start, start_with_vehicle};
 
 #[tokio::test]
 async fn a_hostile_frame_ends_its_own_connection_only() {
@@ -47,8 +47,7 @@ async fn a_hostile_frame_ends_its_own_connection_only() {
 
 #[tokio::test]
 async fn only_a_handshake_of_the_standard_opens_the_control_channel() {
-    let (_folder, server, admin) = start().await;
-    let (vehicle, _) = admin.enrol("car-7").await;
+    let (_folder, server, _, vehicle) = start_with_vehicle().await;
     // Key and answer are the example of RFC 6455, section 1.3.
     let headers = [
         ("connection", "Upgrade"),
@@ -77,8 +76,7 @@ async fn only_a_handshake_of_the_standard_opens_the_control_channel() {
 
 #[tokio::test]
 async fn requests_without_a_right_are_refused() {
-    let (_folder, server, admin) = start().await;
-    let (vehicle, _) = admin.enrol("car-7").await;
+    let (_folder, server, admin, vehicle) = start_with_vehicle().await;
     let (status, _) = vehicle.get("/v1/objects/..%2f..%2fcloud.db").await;
     assert_eq!(status, StatusCode::BAD_REQUEST);
     let (status, _) = vehicle.get(&format!("/v1/objects/{}", "0".repeat(64))).await;

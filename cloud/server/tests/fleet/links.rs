@@ -9,12 +9,11 @@ use hyper::{Method, StatusCode};
 use serde_json::{Value, json};
 
 use crate::fake::{Person, csr, soon};
-use crate::{deploy, reported, signed, start};
+use crate::{deploy, reported, signed, start, start_with_vehicle};
 
 #[tokio::test]
 async fn a_newer_connection_takes_the_place_of_an_older_one() {
-    let (_folder, server, admin) = start().await;
-    let (vehicle, _) = admin.enrol("car-7").await;
+    let (_folder, server, admin, vehicle) = start_with_vehicle().await;
     let (mut older, ..) = vehicle.connect().await;
     let (mut newer, welcome, _) = vehicle.connect().await;
     assert_eq!(welcome.epoch, 2);
@@ -29,8 +28,7 @@ async fn a_newer_connection_takes_the_place_of_an_older_one() {
 
 #[tokio::test]
 async fn two_connections_of_a_vehicle_leave_it_online() {
-    let (_folder, server, admin) = start().await;
-    let (vehicle, _) = admin.enrol("car-7").await;
+    let (_folder, server, admin, vehicle) = start_with_vehicle().await;
     let mut link = vehicle.connect().await.0;
     let is_done = Arc::new(AtomicBool::new(false));
     let (watcher, done) = (admin.at(server.people), Arc::clone(&is_done));
@@ -67,8 +65,7 @@ async fn a_vehicle_that_is_enrolled_again_stays_connected_until_it_uses_that() {
 
 #[tokio::test]
 async fn no_change_is_missed_while_frames_are_handled() {
-    let (_folder, server, admin) = start().await;
-    let (vehicle, _) = admin.enrol("car-7").await;
+    let (_folder, server, admin, vehicle) = start_with_vehicle().await;
     deploy(&admin, &signed(1)).await;
     let (mut link, ..) = vehicle.connect().await;
     link.send(reported(1)).await;
@@ -89,8 +86,7 @@ async fn no_change_is_missed_while_frames_are_handled() {
 
 #[tokio::test]
 async fn a_vehicle_fetches_only_deployments_that_are_for_it() {
-    let (_folder, server, admin) = start().await;
-    let (vehicle, _) = admin.enrol("car-7").await;
+    let (_folder, server, admin, vehicle) = start_with_vehicle().await;
     let (other, _) = admin.enrol("car-8").await;
     let envelope = deploy(&admin, &signed(1)).await;
     let (mut link, ..) = vehicle.connect().await;
@@ -104,8 +100,7 @@ async fn a_vehicle_fetches_only_deployments_that_are_for_it() {
 
 #[tokio::test]
 async fn a_vehicle_in_a_loop_gets_few_certificates_and_connections() {
-    let (_folder, server, admin) = start().await;
-    let (vehicle, _) = admin.enrol("car-7").await;
+    let (_folder, server, admin, vehicle) = start_with_vehicle().await;
     let renew = RenewRequest { csr: csr(&rcgen::KeyPair::generate().unwrap()) };
     for number in 0..5 {
         let expected = if number < 3 { StatusCode::OK } else { StatusCode::TOO_MANY_REQUESTS };
@@ -126,8 +121,7 @@ async fn a_vehicle_in_a_loop_gets_few_certificates_and_connections() {
 
 #[tokio::test]
 async fn a_stream_ends_with_its_user() {
-    let (_folder, server, admin) = start().await;
-    let (vehicle, _) = admin.enrol("car-7").await;
+    let (_folder, server, admin, vehicle) = start_with_vehicle().await;
     let (mut link, ..) = vehicle.connect().await;
     link.record(0..1).await;
     let new = json!({ "name": "ann", "role": "viewer" });
@@ -143,8 +137,7 @@ async fn a_stream_ends_with_its_user() {
 
 #[tokio::test]
 async fn a_vehicle_learns_at_once_which_of_its_streams_are_followed() {
-    let (_folder, server, admin) = start().await;
-    let (vehicle, _) = admin.enrol("car-7").await;
+    let (_folder, server, admin, vehicle) = start_with_vehicle().await;
     let (mut link, ..) = vehicle.connect().await;
     let follow = async |path: &str| admin.open(Method::GET, path, b"").await.into_body();
     // A person who reads what is there, and no more, needs nothing of the vehicle.

@@ -35,6 +35,13 @@ async fn start() -> (TempDir, CloudServer, Person) {
     (folder, server, admin)
 }
 
+/// Starts a cloud, and enrols the vehicle `car-7`.
+async fn start_with_vehicle() -> (TempDir, CloudServer, Person, FakeVehicle) {
+    let (folder, server, admin) = start().await;
+    let (vehicle, _) = admin.enrol("car-7").await;
+    (folder, server, admin, vehicle)
+}
+
 /// A signed deployment of a lambda with one file.
 struct Signed {
     deployment: String,

@@ -14,7 +14,7 @@ use tempfile::TempDir;
 use tokio::time::{Duration, sleep};
 
 use crate::fake::{Person, cursor_after, soon};
-use crate::{deploy, options, postgres, reported, signed, start};
+use crate::{deploy, options, postgres, reported, signed, start, start_with_vehicle};
 
 #[tokio::test]
 async fn a_restart_keeps_everything() {
@@ -52,8 +52,7 @@ async fn a_restart_keeps_everything() {
 
 #[tokio::test]
 async fn many_records_move_into_files_and_are_read_and_found_as_before() {
-    let (folder, server, admin) = start().await;
-    let (vehicle, _) = admin.enrol("car-7").await;
+    let (folder, server, admin, vehicle) = start_with_vehicle().await;
     let mut link = vehicle.connect().await.0;
     for part in 0..5 {
         link.record(part * 4000..(part + 1) * 4000).await;

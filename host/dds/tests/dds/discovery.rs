@@ -39,8 +39,7 @@ fn listed() {
 }
 
 fn definitions() {
-    let domain = domain();
-    let mut dds = open(domain);
+    let (domain, mut dds) = open();
     dds.subscribe(&spec("/subscribed", Qos::Auto), KeptSamples::new()).unwrap();
     let first = dds.definitions("/subscribed").unwrap();
     let second = dds.definitions("/subscribed").unwrap();
@@ -57,8 +56,7 @@ fn definitions() {
 }
 
 fn hostile_names() {
-    let domain = domain();
-    let dds = open(domain);
+    let (domain, dds) = open();
     let peer = Peer::join(domain);
     let long = format!("rt/{}", "n".repeat(2000));
     let _both = [("rt/\u{1b}[2J", "x\ny"), (long.as_str(), "x")].map(|(topic, type_name)| {

@@ -11,7 +11,7 @@ use gleaner_transport::{Qos, Transport};
 use rustix::process::{Pid, setpriority_process};
 
 use super::Test;
-use super::peer::{KeptSamples, Peer, domain, matched, open, spec, write};
+use super::peer::{KeptSamples, Peer, domain, matched, open_in, spec, write};
 
 pub const TESTS: &[Test] =
     &[("a_sample_that_is_written_at_the_match_reaches_a_slow_receive_thread", first)];
@@ -21,7 +21,7 @@ const TOPICS: usize = 30;
 fn first() {
     let domain = domain();
     let others = receive_threads();
-    let mut dds = open(domain);
+    let mut dds = open_in(domain);
     // It gets about a sixtieth of the time of a busy thread. So RustDDS often matches the writer,
     // and receives its sample, while the receive thread still prepares the reader.
     for thread in receive_threads().difference(&others) {

@@ -82,13 +82,13 @@ fn parse(cdr: &[u8], gid: usize) -> Option<ParsedMessage> {
     (at == cdr.len()).then_some(ParsedMessage { participant, nodes })
 }
 
-fn open(domain: u16, distro: Option<Distro>) -> Dds {
-    Dds::open(DdsOptions { distro, ..options(domain) }).unwrap()
+fn open(distro: Option<Distro>) -> (u16, Dds) {
+    let domain = domain();
+    (domain, Dds::open(DdsOptions { distro, ..options(domain) }).unwrap())
 }
 
 fn silent() {
-    let domain = domain();
-    let dds = open(domain, None);
+    let (domain, dds) = open(None);
     let peer = Peer::join(domain);
     let reader = peer.reader(TOPIC, TYPE, &policies(true, true));
     until("the other participant", || dds.health().network.unwrap().participants == 1);
@@ -100,8 +100,7 @@ fn silent() {
 
 fn listed(distro: Distro) {
     let gid = if distro == Distro::Humble { 24 } else { 16 };
-    let domain = domain();
-    let mut dds = open(domain, None);
+    let (domain, mut dds) = open(None);
     let peer = Peer::join(domain);
     let reader = peer.reader(TOPIC, TYPE, &policies(true, true));
     let subscription =
@@ -157,8 +156,7 @@ fn listed(distro: Distro) {
 }
 
 fn both() {
-    let domain = domain();
-    let dds = open(domain, None);
+    let (domain, dds) = open(None);
     let (old, new) = (Peer::join(domain), Peer::join(domain));
     let reader = old.reader(TOPIC, TYPE, &policies(true, true));
     let _old = announce(&old, 24);
@@ -180,8 +178,7 @@ fn both() {
 
 fn wrong_distro() {
     for (configured, gid) in [(Distro::Humble, 16), (Distro::Newer, 24)] {
-        let domain = domain();
-        let dds = open(domain, Some(configured));
+        let (domain, dds) = open(Some(configured));
         until("being listed", || dds.graph().starts_with("listed"));
         let peer = Peer::join(domain);
         let _node = announce(&peer, gid);

@@ -8,8 +8,8 @@ use serde::{Deserialize, Serialize};
 
 use super::Test;
 use super::peer::{
-    KeptSamples, Little, Peer, Subscribed, connected, domain, matched, open, policies, spec,
-    subscribed, until, write,
+    KeptSamples, Little, Peer, Subscribed, connected, matched, open, policies, spec, subscribed,
+    until, write,
 };
 use super::type_query::{announce, announcement};
 
@@ -36,8 +36,7 @@ fn warned(dds: &Dds, subscription: gleaner_transport::Subscription, sentence: &s
 }
 
 fn two_layouts() {
-    let domain = domain();
-    let mut dds = open(domain);
+    let (domain, mut dds) = open();
     let sink = KeptSamples::new();
     let subscription = dds.subscribe(&spec("/name", Qos::Auto), sink.clone()).unwrap();
     assert_eq!(dds.type_hash("/name"), None, "no writer announces one");
@@ -114,8 +113,7 @@ fn unmatched() {
 }
 
 fn not_messages() {
-    let domain = domain();
-    let mut dds = open(domain);
+    let (domain, mut dds) = open();
     let peer = Peer::join(domain);
     for (name, package, type_name) in [
         ("/spin/_action/feedback", "nav2_msgs::action", "nav2_msgs/action/Spin_FeedbackMessage"),

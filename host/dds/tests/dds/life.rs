@@ -14,7 +14,7 @@ use gleaner_transport::{Clock, Delivery, LiveSource, Qos, SampleMeta, Sink, Tran
 
 use super::Test;
 use super::peer::{
-    KeptSamples, Peer, connected, domain, matched, open, options, spec, until, write,
+    KeptSamples, Peer, connected, domain, matched, open, open_in, options, spec, until, write,
 };
 
 /// The test that needs to run alone: no other may have threads of the library.
@@ -71,7 +71,7 @@ fn signals() {
     };
     let own = Path::new("/proc/thread-self");
     let before = blocked(own);
-    let _dds = open(domain());
+    let (_, _dds) = open();
     assert_eq!(blocked(own), before);
     // SIGALRM, SIGTERM, SIGCHLD; SIGSEGV is a thread's own.
     let bits = [14, 15, 17].map(|signal| 1 << (signal - 1)).iter().sum::<u64>();
@@ -108,8 +108,7 @@ impl Sink for Stuck {
 }
 
 fn stuck() {
-    let domain = domain();
-    let mut dds = open(domain);
+    let (domain, mut dds) = open();
     let (sink, release) = Stuck::new();
     let subscription = dds.subscribe(&spec("/stuck", Qos::Auto), sink.clone()).unwrap();
     let peer = Peer::join(domain);
@@ -142,8 +141,7 @@ impl Sink for Panicking {
 }
 
 fn panicking() {
-    let domain = domain();
-    let mut dds = open(domain);
+    let (domain, mut dds) = open();
     let kept = KeptSamples::new();
     let bad = dds.subscribe(&spec("/bad", Qos::Auto), Arc::new(Panicking)).unwrap();
     let good = dds.subscribe(&spec("/good", Qos::Auto), kept.clone()).unwrap();
@@ -178,7 +176,7 @@ fn dropped() {
         // Also if this thread panics, or the other one would not end.
         let _end = RaiseOnDrop(&ended);
         for _ in 0..5 {
-            let mut dds = open(domain);
+            let mut dds = open_in(domain);
             let sink = KeptSamples::new();
             dds.subscribe(&spec("/stream", Qos::Auto), sink.clone()).unwrap();
             sink.wait(100);
@@ -198,8 +196,7 @@ impl Drop for RaiseOnDrop<'_> {
 }
 
 fn dropped_while_stuck() {
-    let domain = domain();
-    let mut dds = open(domain);
+    let (domain, mut dds) = open();
     let (sink, release) = Stuck::new();
     let subscription = dds.subscribe(&spec("/stuck", Qos::Auto), sink.clone()).unwrap();
     let peer = Peer::join(domain);

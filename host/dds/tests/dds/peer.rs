@@ -38,8 +38,14 @@ pub fn options(domain: u16) -> DdsOptions {
     }
 }
 
-pub fn open(domain: u16) -> Dds {
+pub fn open_in(domain: u16) -> Dds {
     Dds::open(options(domain)).unwrap()
+}
+
+/// A participant in a domain of its own.
+pub fn open() -> (u16, Dds) {
+    let domain = domain();
+    (domain, open_in(domain))
 }
 
 pub fn spec(topic: &str, qos: Qos) -> TopicSpec {
@@ -136,8 +142,7 @@ pub struct Subscribed {
 }
 
 pub fn subscribed(topic: &str, qos: Qos) -> Subscribed {
-    let domain = domain();
-    let mut dds = open(domain);
+    let (domain, mut dds) = open();
     let sink = KeptSamples::new();
     let subscription = dds.subscribe(&spec(topic, qos), sink.clone()).unwrap();
     Subscribed { domain, dds, sink, subscription, peer: Peer::join(domain) }

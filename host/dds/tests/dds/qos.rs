@@ -6,8 +6,8 @@ use rustdds::RTPSEntity;
 use super::Test;
 use super::hostile::{LITTLE, data, send};
 use super::peer::{
-    KeptSamples, Little, Peer, Subscribed, connected, domain, matched, open, policies, spec,
-    subscribed, until, write,
+    KeptSamples, Little, Peer, Subscribed, connected, domain, matched, open, open_in, policies,
+    spec, subscribed, until, write,
 };
 
 pub const TESTS: &[Test] = &[
@@ -54,7 +54,7 @@ fn auto_transient_local() {
     for n in 0..5 {
         write(&writer, &[n; 4]);
     }
-    let mut dds = open(domain);
+    let mut dds = open_in(domain);
     let sink = KeptSamples::new();
     let subscription = dds.subscribe(&spec("/map", Qos::Auto), sink.clone()).unwrap();
     assert_eq!(sink.bytes(5), (0..5).map(|n| vec![n; 4]).collect::<Vec<_>>());
@@ -87,8 +87,7 @@ fn auto_recovers() {
 }
 
 fn fixed_does_not_fit() {
-    let domain = domain();
-    let mut dds = open(domain);
+    let (domain, mut dds) = open();
     let qos = Qos::Fixed { reliable: true, transient_local: false, depth: 5 };
     let subscription = dds.subscribe(&spec("/strict", qos), KeptSamples::new()).unwrap();
     let peer = Peer::join(domain);

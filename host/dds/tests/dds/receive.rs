@@ -9,8 +9,8 @@ use rustdds::{RTPSEntity, Timestamp};
 
 use super::Test;
 use super::peer::{
-    Big, KeptSamples, Parameters, Peer, Subscribed, connected, domain, matched, open, policies,
-    spec, subscribed, until, write,
+    Big, KeptSamples, Parameters, Peer, Subscribed, connected, matched, open, policies, spec,
+    subscribed, until, write,
 };
 
 pub const TESTS: &[Test] = &[
@@ -100,8 +100,7 @@ impl Sink for Copies {
 }
 
 fn copied() {
-    let domain = domain();
-    let mut dds = open(domain);
+    let (domain, mut dds) = open();
     let sink = Arc::new(Copies::default());
     let subscription = dds.subscribe(&spec("/copied", FIXED), sink.clone()).unwrap();
     let peer = Peer::join(domain);
@@ -130,8 +129,7 @@ impl Sink for PanicsInCopy {
 }
 
 fn panics_in_copy() {
-    let domain = domain();
-    let mut dds = open(domain);
+    let (domain, mut dds) = open();
     let (first, second) = (KeptSamples::new(), KeptSamples::new());
     let bad = dds.subscribe(&spec("/both", FIXED), Arc::new(PanicsInCopy)).unwrap();
     let good = dds.subscribe(&spec("/both", FIXED), first.clone()).unwrap();
@@ -178,8 +176,7 @@ fn malformed() {
 }
 
 fn two_subscriptions() {
-    let domain = domain();
-    let mut dds = open(domain);
+    let (domain, mut dds) = open();
     let (first, second) = (KeptSamples::new(), KeptSamples::new());
     let subscription = dds.subscribe(&spec("/both", FIXED), first.clone()).unwrap();
     let peer = Peer::join(domain);
@@ -198,7 +195,7 @@ fn two_subscriptions() {
 }
 
 fn bad_names() {
-    let mut dds = open(domain());
+    let (_, mut dds) = open();
     for (topic, type_name) in
         [("no_slash", "a/msg/B"), ("/a b", "a/msg/B"), ("/a", "B"), ("/a", "a/msg/B\n")]
     {

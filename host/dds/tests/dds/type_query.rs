@@ -297,13 +297,13 @@ fn text(dds: &Dds, topic: &str) -> Option<String> {
     found.definitions_text.as_deref().map(str::to_owned)
 }
 
-fn open(domain: u16) -> Dds {
-    Dds::open(DdsOptions { largest: 0, ..options(domain) }).unwrap()
+fn open() -> (u16, Dds) {
+    let domain = domain();
+    (domain, Dds::open(DdsOptions { largest: 0, ..options(domain) }).unwrap())
 }
 
 fn answered(mapping: ServiceMapping) {
-    let domain = domain();
-    let dds = open(domain);
+    let (domain, dds) = open();
     let car = Car::join(domain, Some((mapping, honest)));
     car.announce_hashes(&dds, domain);
     assert_eq!(text(&dds, "/wheel"), None);
@@ -324,8 +324,7 @@ fn answered(mapping: ServiceMapping) {
 /// With plain RustDDS, and with a header: see `docs/dds-limits.md` on the case without.
 fn long() {
     const TEXT: usize = 400_000;
-    let domain = domain();
-    let dds = open(domain);
+    let (domain, dds) = open();
     let car = Car::join(domain, None);
     let peer = Peer(car.participant.clone());
     let policies = policies(true, false);
@@ -357,8 +356,7 @@ fn long() {
 }
 
 fn refused() {
-    let domain = domain();
-    let dds = open(domain);
+    let (domain, dds) = open();
     let respond: Respond =
         |_| Response { failure_reason: "not today".to_owned(), ..Response::default() };
     let car = Car::join(domain, Some((ServiceMapping::Enhanced, respond)));
@@ -371,8 +369,7 @@ fn refused() {
 }
 
 fn wrong_hash() {
-    let domain = domain();
-    let dds = open(domain);
+    let (domain, dds) = open();
     let respond: Respond = |request| {
         let mut response = honest(request);
         response.root.fields.pop();
@@ -385,8 +382,7 @@ fn wrong_hash() {
 }
 
 fn no_hash() {
-    let domain = domain();
-    let dds = open(domain);
+    let (domain, dds) = open();
     let car = Car::join(domain, Some((ServiceMapping::Enhanced, honest)));
     wait_for_both(&dds);
     assert!(!wait(&dds, "/wheel"));
@@ -394,8 +390,7 @@ fn no_hash() {
 }
 
 fn no_service() {
-    let domain = domain();
-    let dds = open(domain);
+    let (domain, dds) = open();
     let car = Car::join(domain, None);
     car.announce_hashes(&dds, domain);
     assert!(!wait(&dds, "/wheel"));
@@ -423,8 +418,7 @@ fn stale() {
 }
 
 fn late_writer() {
-    let domain = domain();
-    let mut dds = open(domain);
+    let (domain, mut dds) = open();
     let spec = gleaner_transport::TopicSpec {
         type_name: "car_msgs/msg/Wheel".to_owned(),
         ..super::peer::spec("/wheel", gleaner_transport::Qos::Auto)

@@ -40,8 +40,7 @@ fn not_ended(reader: &rustdds::discovery::DiscoveredReaderData) -> bool {
 }
 
 fn others() {
-    let domain = domain();
-    let mut dds = open(domain);
+    let (domain, mut dds) = open();
     let sinks = [(); 3].map(|()| KeptSamples::new());
     let [first, second, third] = ["/first", "/second", "/third"];
     let subscriptions = [0, 1, 2].map(|n: usize| {
@@ -69,8 +68,7 @@ fn others() {
 }
 
 fn again() {
-    let domain = domain();
-    let mut dds = open(domain);
+    let (domain, mut dds) = open();
     let peer = Peer::join(domain);
     let writer = peer.writer("/again", true, false);
     let mut received = HashSet::new();

@@ -3,7 +3,7 @@
 use rustdds::{GUID, RTPSEntity};
 
 use super::Test;
-use super::peer::{Peer, domain, open, policies, take, until};
+use super::peer::{Peer, open, policies, take, until};
 use super::type_query::{announce, announcement};
 
 pub const TESTS: &[Test] = &[
@@ -13,8 +13,7 @@ pub const TESTS: &[Test] = &[
 ];
 
 fn written() {
-    let domain = domain();
-    let dds = open(domain);
+    let (domain, dds) = open();
     let writer = dds.writer("/event", "std_msgs/msg/String", 50).unwrap();
     assert_eq!(writer.readers(), 0);
     writer.write(b"no reader...").unwrap();
@@ -37,8 +36,7 @@ fn written() {
 
 /// A reader that exists only in its announcement acknowledges nothing.
 fn unacknowledged() {
-    let domain = domain();
-    let dds = open(domain);
+    let (domain, dds) = open();
     let writer = dds.writer("/event", "std_msgs/msg/String", 300).unwrap();
     let peer = Peer::join(domain);
     let _ready = peer.writer("/ready", true, false);
@@ -55,7 +53,7 @@ fn unacknowledged() {
 }
 
 fn outlives() {
-    let dds = open(domain());
+    let (_, dds) = open();
     let writer = dds.writer("/event", "std_msgs/msg/String", 10).unwrap();
     drop(dds);
     // The result does not matter, but the call must return.

@@ -133,7 +133,9 @@ impl Budgets {
     /// Returns the budgets of the configuration, on this machine.
     pub(crate) fn of(vehicle: &Vehicle) -> Self {
         let cores = available_parallelism().map_or(1, usize::from);
-        Self::on(vehicle, total_memory(), cores)
+        let system = rustix::system::sysinfo();
+        let memory = u64::from(system.mem_unit).saturating_mul(system.totalram);
+        Self::on(vehicle, memory, cores)
     }
 
     pub(super) fn on(vehicle: &Vehicle, memory: u64, cores: usize) -> Self {
@@ -227,10 +229,4 @@ impl Budgets {
     pub(crate) fn demand(&self, demand: &LambdaDemand) -> Vec<ResourceDemand> {
         self.0.iter().map(|budget| budget.resource.of(demand)).collect()
     }
-}
-
-/// Returns the memory of this machine, in bytes.
-fn total_memory() -> u64 {
-    let info = rustix::system::sysinfo();
-    u64::from(info.mem_unit).saturating_mul(info.totalram)
 }

@@ -9,6 +9,7 @@ use std::rc::Rc;
 use gleaner_spool::{SegmentFile, SpoolStorage};
 
 /// Pseudo-random numbers, the same in each run (SplitMix64).
+#[derive(Default)]
 pub struct SpoolRandom(pub u64);
 
 impl SpoolRandom {
@@ -43,6 +44,7 @@ struct Inode {
     unsynced: Vec<(usize, usize)>,
 }
 
+#[derive(Default)]
 struct Disk {
     inodes: Vec<Inode>,
     names: BTreeMap<u64, usize>,
@@ -72,16 +74,7 @@ pub struct SimulatedFile {
 
 impl SimulatedDisk {
     pub fn new(seed: u64) -> SimulatedDisk {
-        SimulatedDisk(Rc::new(RefCell::new(Disk {
-            inodes: Vec::new(),
-            names: BTreeMap::new(),
-            durable_names: BTreeMap::new(),
-            random: SpoolRandom(seed),
-            operations: 0,
-            lists: 0,
-            fault: None,
-            unreadable: None,
-        })))
+        SimulatedDisk(Rc::new(RefCell::new(Disk { random: SpoolRandom(seed), ..Disk::default() })))
     }
 
     pub fn set_fault(&self, fault: Option<DiskFault>) {

@@ -125,20 +125,9 @@ pub fn to_gray(view: &View<'_>, out: &mut [u8]) -> Result<(), PixelError> {
 mod tests {
     use super::*;
     use crate::pixels::Encoding;
-    use crate::pixels::ops::work;
+    use crate::pixels::ops::{noise, work};
 
     const WHOLE: Option<Roi> = None;
-
-    /// Returns pseudo-random bytes, the same in every run.
-    fn noise(len: usize) -> Vec<u8> {
-        let mut state = 1_u32;
-        std::iter::repeat_with(|| {
-            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-            (state >> 24) as u8
-        })
-        .take(len)
-        .collect()
-    }
 
     /// Returns the luma of a pixel in floating point, by the definition of its encoding.
     fn reference(encoding: &str, big_endian: bool, p: &[u8]) -> f64 {
@@ -166,7 +155,7 @@ mod tests {
                 // Wider than a block of 16 bit sums, with a remainder, and padded by 5 bytes.
                 let (width, height) = (LANES * GROUPS / pixel + 38, 3);
                 let step = width * pixel + 5;
-                let data = noise(step * height);
+                let data = noise(1, step * height);
                 let (w, h, s) = (width as u32, height as u32, step as u32);
                 let view = View::new(w, h, s, encoding, big_endian, &data).unwrap();
                 let everything = Roi { x: 0, y: 0, width: w, height: h };
@@ -231,7 +220,7 @@ mod tests {
         for name in READABLE {
             let encoding = Encoding::from_ros(name).unwrap();
             let step = 1_030 * encoding.bytes_per_pixel() + 3;
-            let data = noise(step * 4);
+            let data = noise(1, step * 4);
             let view = View::new(1_030, 4, step as u32, encoding, false, &data).unwrap();
             let mut grey = vec![0; 1_030 * 4];
             to_gray(&view, &mut grey).unwrap();

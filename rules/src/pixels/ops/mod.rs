@@ -28,6 +28,16 @@ pub fn work(view: &View<'_>, roi: Option<Roi>) -> Result<u64, PixelError> {
     Ok(u64::from(roi.width) * u64::from(roi.height) * view.encoding().bytes_per_pixel() as u64)
 }
 
+/// Returns pseudo-random bytes, the same in every run.
+#[cfg(test)]
+fn noise(mut state: u32, len: usize) -> Vec<u8> {
+    let next = || {
+        state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        (state >> 24) as u8
+    };
+    std::iter::repeat_with(next).take(len).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -271,16 +271,7 @@ impl Axis {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn noise(len: usize) -> Vec<u8> {
-        let mut state = 7_u32;
-        std::iter::repeat_with(|| {
-            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-            (state >> 24) as u8
-        })
-        .take(len)
-        .collect()
-    }
+    use crate::pixels::ops::noise;
 
     fn mono(width: u32, height: u32, data: &[u8]) -> View<'_> {
         View::new(width, height, width, Encoding::Mono8, false, data).unwrap()
@@ -308,7 +299,7 @@ mod tests {
 
     #[test]
     fn every_size_agrees_with_floating_point() {
-        let data = noise(7 * 5);
+        let data = noise(7, 7 * 5);
         let view = mono(7, 5, &data);
         for (width, height) in [(3, 2), (7, 5), (1, 1), (6, 4), (14, 10), (20, 3), (2, 17), (8, 6)]
         {
@@ -345,7 +336,7 @@ mod tests {
 
     #[test]
     fn the_same_size_is_the_same_image_without_its_padding() {
-        let data = noise(3 * 20);
+        let data = noise(7, 3 * 20);
         let view = View::new(5, 3, 20, Encoding::Rgb8, false, &data).unwrap();
         let expected: Vec<u8> = data.chunks(20).flat_map(|row| &row[..15]).copied().collect();
         assert_eq!(resized_to(&view, 5, 3), expected);
