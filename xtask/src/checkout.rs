@@ -8,8 +8,6 @@ use std::process::Command;
 
 use gleaner_base::{Exit, Failure};
 
-use crate::onnxruntime;
-
 /// Folders of lambdas; each lambda has a folder with one for each of its twins.
 pub(crate) const FAMILIES: [&str; 3] = ["bench/lambdas", "examples", "tests/lambdas"];
 
@@ -88,13 +86,6 @@ impl Checkout {
             .env("GLEANER_PYTHON", self.python())
             // That of ONNX Runtime, whose wheels send data to Microsoft otherwise.
             .env("ORT_DISABLE_TELEMETRY", "1");
-        command
-    }
-
-    /// A [`command`](Self::command) of a program that cargo built and that may run models.
-    pub(crate) fn with_models(&self, program: &str) -> Command {
-        let mut command = self.command(self.program(program));
-        onnxruntime::pass_to(self, &mut command);
         command
     }
 

@@ -10,6 +10,7 @@ use gleaner_protocol::{ReplaySummary, Verified};
 use gleaner_report::{Decisions, ResultsError, clips};
 
 use crate::checkout::Checkout;
+use crate::onnxruntime::with_models;
 use crate::steps;
 
 /// The drive that comes with the checkout.
@@ -155,7 +156,7 @@ fn replay(
     settings: Vec<String>,
 ) -> Result<TwinReplay, Failure> {
     let out = Path::new("out/demo").join(name);
-    let mut replay = checkout.with_models("gleaner");
+    let mut replay = with_models(checkout, "gleaner");
     replay
         .arg("replay")
         .arg(&lambda)
@@ -177,7 +178,7 @@ fn replay(
 impl TwinReplay {
     /// Repeats every decision of the journal, from the drive.
     pub(crate) fn verify(&self, checkout: &Checkout) -> Result<Verified, Failure> {
-        let mut verify = checkout.with_models("gleaner");
+        let mut verify = with_models(checkout, "gleaner");
         verify
             .arg("replay")
             .arg(&self.lambda)
@@ -194,7 +195,7 @@ impl TwinReplay {
         checkout: &Checkout,
         clip: &Clip,
     ) -> Result<Verified, Failure> {
-        let mut verify = checkout.with_models("gleaner");
+        let mut verify = with_models(checkout, "gleaner");
         verify
             .arg("verify")
             .arg(self.out.join(&clip.file))

@@ -16,7 +16,7 @@ use gleaner_base::{Exit, Failure};
 
 use crate::checkout::Checkout;
 use crate::setup;
-use crate::steps::{self, Steps};
+use crate::steps::{self, Steps, cannot};
 
 /// The fuzz targets. Their other properties are in `gleaner-fuzz`, which would take too long to
 /// build for this list.
@@ -261,10 +261,6 @@ fn option(name: &str, value: impl std::fmt::Display) -> String {
 fn folder(path: PathBuf) -> Result<PathBuf, Failure> {
     fs::create_dir_all(&path).map_err(|error| cannot("make folder", &path, &error))?;
     Ok(path)
-}
-
-fn cannot(what: &str, path: &Path, error: &std::io::Error) -> Failure {
-    Failure::caused_by(Exit::Internal, format!("cannot {what} `{}`", path.display()), error)
 }
 
 #[cfg(test)]

@@ -10,8 +10,7 @@ use gleaner_base::Failure;
 
 use crate::architecture::Architecture;
 use crate::checkout::Checkout;
-use crate::deb::cannot;
-use crate::steps;
+use crate::steps::{self, cannot};
 use crate::venv;
 
 /// Its version, which `cargo xtask models` tests.
@@ -46,6 +45,13 @@ pub(crate) fn fetch(checkout: &Checkout, architecture: Architecture) -> Option<P
 /// Returns the path of the library in the folder that [`fetch`] returns.
 pub(crate) fn library(package: &Path) -> PathBuf {
     package.join(format!("capi/libonnxruntime.so.{VERSION}"))
+}
+
+/// A command of a program that cargo built and that may run models.
+pub(crate) fn with_models(checkout: &Checkout, program: &str) -> Command {
+    let mut command = checkout.command(checkout.program(program));
+    pass_to(checkout, &mut command);
+    command
 }
 
 /// Passes the path of the fetched library to `command`, if there is one, unless the user has named

@@ -2,6 +2,7 @@
 //! shows the output of its tool, and gives help if it fails.
 
 use std::io::{self, Write};
+use std::path::Path;
 use std::process::{Command, Output, Stdio};
 use std::time::Instant;
 
@@ -38,6 +39,11 @@ impl Steps {
             println!("[{}/{}] took {seconds:.1} s", self.started, self.total);
         }
     }
+}
+
+/// Returns the failure of an access to a file.
+pub(crate) fn cannot(action: &str, path: &Path, error: &io::Error) -> Failure {
+    Failure::caused_by(Exit::Internal, format!("cannot {action} `{}`", path.display()), error)
 }
 
 /// Runs `command` with its output shown. `help` is for the error message if it fails.

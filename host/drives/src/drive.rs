@@ -197,8 +197,8 @@ impl Replay {
     ///
     /// # Errors
     ///
-    /// [`ReplayError::Damaged`], [`ReplayError::WithoutLatched`] or [`ReplayError::Read`], once; see
-    /// [`Replay`] for what was delivered before. Every later call returns `None`.
+    /// [`ReplayError::Damaged`], [`ReplayError::WithoutLatched`] or [`ReplayError::Read`], once;
+    /// see [`Replay`] for what was delivered before. Every later call returns `None`.
     pub fn step(&mut self) -> Result<Option<ReplayStep>, ReplayError> {
         self.start()?;
         if let Some(earlier) = self.latched.pop_front() {

@@ -36,7 +36,7 @@ pub fn is_late(elapsed: Duration, allowed: Duration) -> bool {
     elapsed > allowed.saturating_add(TOLERANCE)
 }
 
-/// What runs a lambda: a decision is only reproducible on the same engine. Its text has all parts,
+/// The engine of a lambda, on which alone its decisions are reproducible. Its text has all parts,
 /// with a semicolon between them.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct LambdaEngine {

@@ -11,13 +11,16 @@ use gleaner_ingress::Ingress;
 use gleaner_lambda::manifest::Manifest;
 use gleaner_messages::Sources;
 use gleaner_protocol::ingress::{AddReader, IngressControl, TopicGrant};
+use gleaner_tests::TempFolder;
 use gleaner_transport::loopback::Loopback;
 use gleaner_transport::{Guid, SampleMeta};
 
-use crate::live::{Announced, LAYOUT, WrittenLoopback};
+use crate::live::{Announced, WrittenLoopback};
+use crate::live_layouts::LAYOUT;
 use crate::meta;
 
 const TYPE: &str = "test_msgs/msg/Number";
+const DEFINITION: &str = "int64 value\n";
 
 /// Inputs of a lambda, and the ingress that fills them.
 struct FedInputs {
@@ -35,9 +38,11 @@ impl FedInputs {
                         entry = \"many.wasm\"\n[schedule]\nevent = \"input_0\"\n"
             .to_owned();
         let loopback = Loopback::new();
+        let folder = TempFolder::new();
+        folder.write("test_msgs/Number.msg", DEFINITION);
         for number in 0..count {
             let (input, topic) = (format!("input_{number}"), topic(number));
-            loopback.add_topic(&topic, TYPE, "int64 value\n");
+            loopback.add_topic(&topic, TYPE, DEFINITION);
             writeln!(text, "[[input]]\nname = {input:?}\ntopic = {topic:?}\ntype = {TYPE:?}")
                 .and_then(|()| writeln!(text, "{lines}"))
                 .unwrap();
@@ -53,7 +58,7 @@ impl FedInputs {
         let (mut control, ingress) = Ingress::start_in_thread(Box::new(source));
         let added = AddReader { name: "many".to_owned(), topics, publishes: Vec::new() };
         let mut feed = Feed::connect(control.add_reader(&added).unwrap()).unwrap();
-        let sources = Sources::new(&[], &[]);
+        let sources = Sources::new(&[folder.path().to_owned()], &[]);
         let topics = open_fed_inputs(&manifest, &[], &mut feed, &sources).unwrap();
         Self { topics, loopback, feed, control, ingress }
     }

@@ -89,9 +89,6 @@ impl Guest for NumbersGuest {
     }
 }
 
-/// Hash of the layout "int64 value", by rosbags.
-pub const LAYOUT: &str = "RIHS01_376752aeb9e256c4e2313368a5a32645d62041d37777621433ea5e52e280b5ea";
-
 /// The hash that writers have announced.
 pub type Announced = Arc<Mutex<Option<String>>>;
 

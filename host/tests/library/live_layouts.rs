@@ -1,6 +1,9 @@
 //! Samples whose layout writers announce after the lambda has chosen its definitions.
 
-use crate::live::{LAYOUT, Running};
+use crate::live::Running;
+
+/// Hash of the layout "int64 value", by rosbags.
+pub const LAYOUT: &str = "RIHS01_376752aeb9e256c4e2313368a5a32645d62041d37777621433ea5e52e280b5ea";
 
 #[test]
 fn samples_of_an_announced_layout_wait_until_it_is_known_to_be_that_of_the_definitions() {

@@ -10,7 +10,7 @@ use super::tree::{self, PackageTree};
 use crate::architecture::Architecture;
 use crate::checkout::Checkout;
 use crate::glibc::GlibcNeeds;
-use crate::steps;
+use crate::steps::{self, cannot};
 
 /// Scripts that dpkg runs.
 const SCRIPTS: [&str; 3] = ["postinst", "prerm", "postrm"];
@@ -129,7 +129,7 @@ fn libraries(checkout: &Checkout, tree: &PackageTree) -> Result<Option<String>, 
     // It reads `debian/control` of a source package.
     let folder = checkout.target().join("deb/shlibdeps");
     let control = folder.join("debian/control");
-    let failed = |error: std::io::Error| tree::cannot("write", &control, &error);
+    let failed = |error: std::io::Error| cannot("write", &control, &error);
     std::fs::create_dir_all(folder.join("debian")).map_err(failed)?;
     std::fs::write(&control, "Source: gleaner\n\nPackage: gleaner\nArchitecture: any\n")
         .map_err(failed)?;

@@ -27,7 +27,7 @@ use control::PackageMetadata;
 pub(crate) use control::PackagedCommit;
 use source::PACKAGES;
 pub(crate) use source::{LIB, PackageSource, VEHICLE_PROGRAMS};
-pub(crate) use tree::{PackageTree, cannot};
+pub(crate) use tree::PackageTree;
 
 const USAGE: &str = "usage: cargo xtask deb [--arch amd64|arm64] [--programs DIR] [--test]
   --arch      architecture of the packages; default: that of this machine

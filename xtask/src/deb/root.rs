@@ -10,7 +10,7 @@ use gleaner_base::{Exit, Failure};
 use super::source::PackageSource;
 use super::{answer, tree};
 use crate::checkout::Checkout;
-use crate::steps;
+use crate::steps::{self, cannot};
 
 /// Packages of the root, beyond those that are required: for Python lambdas, and the units.
 const PACKAGES: &str = "dbus,init-system-helpers,python3,python3-numpy,python3-venv,systemd";
@@ -86,7 +86,7 @@ fn base(checkout: &Checkout, work: &Path) -> Result<PathBuf, Failure> {
         make.args(["--variant=minbase", &format!("--include={PACKAGES}"), &suite]).arg(&unfinished);
         steps::run(&mut make, "check the network")
             .map_err(|failure| Failure { exit: Exit::Unreachable, ..failure })?;
-        fs::rename(&unfinished, &base).map_err(|error| tree::cannot("move", &base, &error))?;
+        fs::rename(&unfinished, &base).map_err(|error| cannot("move", &base, &error))?;
     }
     Ok(base)
 }
@@ -104,7 +104,7 @@ fn prepare(
     let _ = fs::remove_dir_all(&root);
     copy(checkout, base, &root)?;
     let test = root.join("test");
-    fs::create_dir(&test).map_err(|error| tree::cannot("create", &test, &error))?;
+    fs::create_dir(&test).map_err(|error| cannot("create", &test, &error))?;
     copy(checkout, package, &test.join("gleaner.deb"))?;
     for script in ["in-root", "booted"] {
         let script = checkout.path(source.folder).join("test").join(script);
@@ -136,7 +136,7 @@ fn boot(checkout: &Checkout, root: &Path, arguments: &[String]) -> Result<(), Fa
     fs::create_dir_all(&wants)
         .and_then(|()| fs::write(units.join("test.service"), unit))
         .and_then(|()| std::os::unix::fs::symlink("../test.service", wants.join("test.service")))
-        .map_err(|error| tree::cannot("write", &units, &error))?;
+        .map_err(|error| cannot("write", &units, &error))?;
     let mut boot = checkout.command("systemd-nspawn");
     boot.args(["--quiet", "--boot", "--private-network", "--register=no", "--keep-unit"]);
     boot.arg(format!("--system-call-filter={CALLS}"));

@@ -4,14 +4,14 @@ use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
-use gleaner_base::{Exit, Failure};
+use gleaner_base::Failure;
 
 use super::licences;
 use super::source::{LIB, PackageSource};
 use crate::architecture::Architecture;
 use crate::checkout::Checkout;
 use crate::onnxruntime;
-use crate::steps;
+use crate::steps::{self, cannot};
 
 /// Completion scripts of shells.
 const COMPLETIONS: [(&str, &str); 3] = [
@@ -208,10 +208,6 @@ fn entries(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
     }
     paths.sort();
     Ok(paths)
-}
-
-pub(crate) fn cannot(action: &str, path: &Path, error: &std::io::Error) -> Failure {
-    Failure::caused_by(Exit::Internal, format!("cannot {action} `{}`", path.display()), error)
 }
 
 #[cfg(test)]

@@ -8,7 +8,7 @@ use super::answer;
 use super::source::PackageSource;
 use super::tree::{self, PackageTree};
 use crate::checkout::Checkout;
-use crate::steps;
+use crate::steps::{self, cannot};
 
 /// The first version that knows the keys of `control-groups.conf`.
 const WITH_SUBGROUPS: u32 = 254;
@@ -51,7 +51,7 @@ pub(super) fn check(
     }
     let mut verify = checkout.command("systemd-analyze");
     verify.args(["verify", "--man=no"]).arg(&unit);
-    let output = verify.output().map_err(|error| tree::cannot("verify", &unit, &error))?;
+    let output = verify.output().map_err(|error| cannot("verify", &unit, &error))?;
     let remarks = String::from_utf8_lossy(&output.stderr);
     // It succeeds with unknown keys, too. Remarks on other units of this machine do not count.
     if !output.status.success() || remarks.contains("gleaner") {
@@ -92,7 +92,7 @@ fn write(file: &Path, text: &str) -> Result<(), Failure> {
     let folder = file.parent().unwrap_or(file);
     std::fs::create_dir_all(folder)
         .and_then(|()| std::fs::write(file, text))
-        .map_err(|error| tree::cannot("write", file, &error))
+        .map_err(|error| cannot("write", file, &error))
 }
 
 #[cfg(test)]

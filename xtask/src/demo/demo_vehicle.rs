@@ -17,6 +17,7 @@ use signal_hook::consts::SIGTERM;
 
 use super::demo_cloud::account;
 use crate::checkout::Checkout;
+use crate::onnxruntime;
 use crate::steps;
 
 /// Folder of everything that the demo leaves, relative to the checkout.
@@ -73,7 +74,7 @@ impl<'c> DemoVehicle<'c> {
             ["root", "publisher", "deployer"].map(|key| file(&format!("{key}.pem")));
         let keys = ["--root", &root, "--publisher", &publisher, "--deployer", &deployer];
         vehicle.gleaner(&[&["trust", "new", &trust], &keys[..]].concat())?;
-        let mut orchestrator = checkout.with_models("gleaner-orchestrator");
+        let mut orchestrator = onnxruntime::with_models(checkout, "gleaner-orchestrator");
         orchestrator.arg("--state").arg(out.join("state")).arg("--run").arg(&vehicle.run);
         orchestrator.arg("--vehicle").arg(out.join("vehicle.toml"));
         orchestrator.stdin(Stdio::null()).stdout(Stdio::null()).stderr(log);

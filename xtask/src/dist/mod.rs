@@ -12,8 +12,8 @@ use gleaner_base::{Exit, Failure};
 use crate::aarch64::{self, Tools};
 use crate::architecture::Architecture;
 use crate::checkout::{Checkout, FAMILIES};
-use crate::deb::{self, PackagedCommit, cannot};
-use crate::steps::{self, Steps};
+use crate::deb::{self, PackagedCommit};
+use crate::steps::{self, Steps, cannot};
 use crate::{glibc, player, setup};
 use tarball::TARBALL;
 

@@ -10,8 +10,9 @@ use gleaner_base::Failure;
 use super::BENCH;
 use crate::architecture::Architecture;
 use crate::checkout::{Checkout, FAMILIES};
-use crate::deb::{LIB, PackageSource, PackageTree, PackagedCommit, VEHICLE_PROGRAMS, cannot};
-use crate::{setup, steps};
+use crate::deb::{LIB, PackageSource, PackageTree, PackagedCommit, VEHICLE_PROGRAMS};
+use crate::setup;
+use crate::steps::{self, cannot};
 
 /// Its content, laid out like that of a package below `usr`, where the programs find each other.
 pub(super) const TARBALL: PackageSource = PackageSource {

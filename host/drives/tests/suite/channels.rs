@@ -163,7 +163,7 @@ fn a_stated_hash_of_a_type_is_compared_only_if_it_has_the_form_of_one() {
         // ROS 2 writes small digits, and reads both (rosidl_parse_type_hash_string).
         (format!("RIHS01_{}", DIGITS.to_uppercase()), true),
         (format!("RIHS01_{}", other.to_uppercase()), false),
-        // The rest is no hash of this kind, and says nothing about the definition.
+        // The rest is no hash of this kind, and has no meaning for the definition.
         (String::new(), true),
         (other.clone(), true),
         (format!("rihs01_{other}"), true),

@@ -56,8 +56,8 @@ fn packages(lib: &Path) -> Vec<PathBuf> {
     folders
 }
 
-/// Returns whether only root, this user and the owner of this program can replace a file, whose path
-/// has no link: a library runs as code.
+/// Returns whether only root, this user and the owner of this program can replace a file, whose
+/// path has no link: a library runs as code.
 fn is_private(file: &Path) -> bool {
     let program = std::env::current_exe().and_then(|program| program.metadata());
     let user = geteuid().as_raw();
