@@ -14,7 +14,7 @@ pub const LINES: &[(&str, usize, usize)] = &[
     ("fuzz", 4216, 86),
     ("guest-sdk-python", 5876, 4099),
     ("guest-sdk-rust", 5394, 1621),
-    ("host", 62377, 30251),
+    ("host", 62377, 30253),
     ("journal", 1869, 1266),
     ("lambda", 4680, 2183),
     ("orchestrator", 24163, 7656),
