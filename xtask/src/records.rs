@@ -29,68 +29,69 @@ struct HeavyPart {
     has_programs: bool,
     /// Further files and folders that it reads, relative to the checkout.
     files: &'static [&'static str],
-    /// Unit of its result, and the text in each line of its output that is counted.
-    counted: (&'static str, &'static str),
+    /// Least number of its results, their unit, and the text in each line of its output that is
+    /// counted.
+    counted: (usize, &'static str, &'static str),
+    /// True if it only installs what tests need, and they are of the last part.
+    tests_follow: bool,
 }
-
-/// The part that builds test programs on other DDS implementations.
-const PEERS: &str = "peers, on Cyclone DDS and Fast DDS";
 
 const HEAVY: [HeavyPart; 8] = [
     HeavyPart {
         name: "lints: gleaner-host for fewer kinds of lambdas",
         packages: &["gleaner-host"],
         has_programs: false,
-        files: &["rustfmt.toml", "rust-toolchain.toml"],
-        counted: ("kinds checked", "Finished "),
+        files: &["clippy.toml"],
+        counted: (3, "kinds checked", "Finished "),
+        tests_follow: false,
     },
     HeavyPart {
-        name: PEERS,
+        name: "peers, on Cyclone DDS and Fast DDS",
         packages: &["gleaner-tests"],
         has_programs: true,
         files: &["xtask/src/peers.rs", "examples", "tests/lambdas", "guest-sdk-python/gleaner"],
-        counted: ("steps", "] "),
+        counted: (1, "steps", "] "),
+        tests_follow: true,
     },
     HeavyPart {
         name: "page, in a browser",
         packages: &["gleaner-cloud"],
         has_programs: false,
         files: &["xtask/src/page.rs"],
-        counted: ("flows", "ok "),
+        counted: (19, "flows", "ok "),
+        tests_follow: false,
     },
     HeavyPart {
         name: "models, by the tests of ONNX",
         packages: &["gleaner-inference"],
         has_programs: false,
-        files: &["xtask/src/models.rs", "tests/models"],
-        counted: ("backends", " right "),
+        files: &["docs/models.md", "tests/models", "xtask/src/models.rs"],
+        counted: (2, "backends", " right "),
+        tests_follow: false,
     },
     HeavyPart {
         name: "benches, quick",
         packages: &["gleaner-bench"],
         has_programs: true,
-        files: &[
-            "bench",
-            "examples",
-            "guest-sdk-python/gleaner",
-            "xtask/src/bench.rs",
-            "xtask/src/setup.rs",
-        ],
-        counted: ("benches measured", ": measured"),
+        files: &["bench", "examples", "guest-sdk-python/gleaner", "xtask/src/bench.rs"],
+        counted: (9, "benches measured", ": measured"),
+        tests_follow: false,
     },
     HeavyPart {
         name: "benches, quick: fleet",
         packages: &["gleaner-fleet-bench", "gleaner-cloud"],
         has_programs: false,
         files: &["xtask/src/bench.rs"],
-        counted: ("measurements", "| "),
+        counted: (1, "measurements", "| "),
+        tests_follow: false,
     },
     HeavyPart {
         name: "cloud of three replicas, with kills",
         packages: &["gleaner-fleet-bench", "gleaner-cloud"],
         has_programs: false,
         files: &["xtask/src/fleet"],
-        counted: ("kills", "kill "),
+        counted: (4, "kills", "kill "),
+        tests_follow: true,
     },
     HeavyPart {
         name: "demo, with a cloud",
@@ -103,12 +104,28 @@ const HEAVY: [HeavyPart; 8] = [
             "xtask/src/examples.rs",
             "xtask/src/onnxruntime.rs",
         ],
-        counted: ("verified clips", "signed by the vehicle"),
+        counted: (1, "verified clips", "signed by the vehicle"),
+        tests_follow: false,
     },
 ];
 
-/// Files and folders on which every part depends.
-const COMMON: [&str; 4] = [".cargo/config.toml", "Cargo.lock", "Cargo.toml", "wit"];
+/// Files and folders on which every part depends: `.ci/run` has the commands of all.
+const COMMON: [&str; 14] = [
+    ".cargo/config.toml",
+    ".ci/run",
+    "Cargo.lock",
+    "Cargo.toml",
+    "guest-sdk-python/LICENSE",
+    "guest-sdk-python/pyproject.toml",
+    "rust-toolchain.toml",
+    "wit",
+    "xtask/Cargo.toml",
+    "xtask/src/checkout.rs",
+    "xtask/src/main.rs",
+    "xtask/src/setup.rs",
+    "xtask/src/steps.rs",
+    "xtask/src/venv.rs",
+];
 
 /// Tests of the source itself and their lists, on which no part depends.
 const HOUSE: [&str; 4] =
@@ -127,39 +144,57 @@ type PartRecords = BTreeMap<String, Record>;
 
 /// Runs all parts, and writes their records.
 pub(crate) fn full(checkout: &Checkout) -> Result<Exit, Failure> {
-    let mut status = checkout.command("git");
-    let changed = steps::output(status.args(["status", "--porcelain"]), "run it in a checkout")?;
+    let changed = git(checkout, &["status", "--porcelain", "--untracked-files=all"])?;
     if !changed.is_empty() {
         let message = format!("a record names a commit, and there are other changes:\n{changed}");
         return Err(Failure::new(Exit::Usage, message).with_help("commit them first"));
     }
-    let mut head = checkout.command("git");
-    let commit = steps::output(head.args(["rev-parse", "HEAD"]), "run it in a checkout")?;
+    let state = || Ok::<_, Failure>((git(checkout, &["rev-parse", "HEAD"])?, digests(checkout)?));
+    let tested = state()?;
     let results = checkout.target().join("full");
+    // Those of an earlier run would count if this one ended before it wrote its own.
+    if results.exists() {
+        fs::remove_dir_all(&results).map_err(|error| cannot("remove", &results, &error))?;
+    }
     fs::create_dir_all(&results).map_err(|error| cannot("make", &results, &error))?;
     let mut run = checkout.script(".ci/run");
     let ended = steps::run(
         run.arg("--full").arg(&results),
         "see the first error above; parts that ended before it are recorded",
     );
-    write(checkout, &results, commit.trim(), ended.is_ok())?;
+    if state()? != tested {
+        let message = "the sources have changed during the run: nothing is recorded";
+        return Err(Failure::new(Exit::Differs, message).with_help("run it again"));
+    }
+    write(checkout, &results, &tested, ended.is_ok())?;
     ended.map(|()| Exit::Ok)
 }
 
-/// Writes the records of the parts in `results`; those of other parts stay. After a run that
-/// failed, that of the peers stays, too, as the last part of the run has their tests.
+fn git(checkout: &Checkout, arguments: &[&str]) -> Result<String, Failure> {
+    let mut git = checkout.command("git");
+    Ok(steps::output(git.args(arguments), "run it in a checkout")?.trim().to_owned())
+}
+
+/// The digest of the sources of each part, by its name.
+fn digests(checkout: &Checkout) -> Result<BTreeMap<&'static str, String>, Failure> {
+    let sources = CheckoutSources::read(checkout)?;
+    HEAVY.iter().map(|part| Ok((part.name, sources.digest(checkout, part)?))).collect()
+}
+
+/// Writes the records of the parts in `results`, which were tested at this commit with these
+/// digests; those of other parts stay. After a run that failed, those of parts whose tests are in
+/// the last part of the run stay, too.
 fn write(
     checkout: &Checkout,
     results: &Path,
-    commit: &str,
+    (commit, digests): &(String, BTreeMap<&'static str, String>),
     has_passed: bool,
 ) -> Result<(), Failure> {
-    let sources = CheckoutSources::read(checkout)?;
     let mut records = read(checkout)?;
-    for part in HEAVY.iter().filter(|part| has_passed || part.name != PEERS) {
+    records.retain(|name, _| digests.contains_key(name.as_str()));
+    for part in HEAVY.iter().filter(|part| has_passed || !part.tests_follow) {
         let Some((seconds, cpu_seconds, result)) = part.result(results)? else { continue };
-        let digest = sources.digest(checkout, part)?;
-        let commit = commit.to_owned();
+        let (digest, commit) = (digests[part.name].clone(), commit.clone());
         let record = Record { digest, commit, seconds, cpu_seconds, result };
         records.insert(part.name.to_owned(), record);
     }
@@ -181,12 +216,17 @@ fn read(checkout: &Checkout) -> Result<PartRecords, Failure> {
 }
 
 /// Prints the record of a part as a row of the table of `.ci/run`, if its sources are the same as
-/// then; otherwise the exit code is [`Exit::Differs`].
+/// then; otherwise the exit code is [`Exit::Differs`]. With the file of its output, counts the
+/// results in that.
 pub(crate) fn print(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
     let name = arguments.first().and_then(|name| name.to_str()).unwrap_or_default();
     let Some(part) = HEAVY.iter().find(|part| part.name == name) else {
         return Err(Failure::new(Exit::Usage, format!("there is no heavy part `{name}`")));
     };
+    if let Some(output) = arguments.get(1) {
+        println!("{}", part.count(Path::new(output))?);
+        return Ok(Exit::Ok);
+    }
     let records = read(checkout)?;
     let Some(record) = records.get(name) else {
         eprintln!("`{name}` has no record in {FILE}");
@@ -214,14 +254,20 @@ impl HeavyPart {
         let (Some(seconds), Some(cpu_seconds)) = (numbers.next(), numbers.next()) else {
             return Err(Failure::new(Exit::Internal, format!("no seconds in `{row}`")));
         };
-        let text = fs::read_to_string(&output).map_err(|error| cannot("read", &output, &error))?;
-        let (unit, sign) = self.counted;
+        Ok(Some((seconds, cpu_seconds, self.count(&output)?)))
+    }
+
+    /// Counts the results in its output: a part that was skipped ends well, and has none.
+    fn count(&self, output: &Path) -> Result<String, Failure> {
+        let text = fs::read_to_string(output).map_err(|error| cannot("read", output, &error))?;
+        let (least, unit, sign) = self.counted;
         let count = text.lines().filter(|line| line.contains(sign)).count();
-        if count == 0 {
-            let message = format!("`{}` ended, and has no {unit}", output.display());
-            return Err(Failure::new(Exit::Internal, message));
+        if count < least {
+            let message = format!("`{}` ended with {count} {unit}, not {least}", self.name);
+            return Err(Failure::new(Exit::Internal, message)
+                .with_help(format!("see `{}`: it may have been skipped", output.display())));
         }
-        Ok(Some((seconds, cpu_seconds, format!("{count} {unit}"))))
+        Ok(format!("{count} {unit}"))
     }
 }
 
@@ -303,4 +349,17 @@ impl CheckoutSources {
 
 fn cannot(what: &str, path: &Path, error: &dyn std::error::Error) -> Failure {
     Failure::caused_by(Exit::Internal, format!("cannot {what} `{}`", path.display()), error)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_heavy_parts_are_those_of_the_script() {
+        let script = include_str!("../../.ci/run");
+        let named = script.lines().filter_map(|line| line.strip_prefix("heavy \""));
+        let named: Vec<_> = named.filter_map(|rest| rest.split('"').next()).collect();
+        assert_eq!(named, HEAVY.map(|part| part.name));
+    }
 }

@@ -259,3 +259,46 @@ fn dependencies_are_those_of_all_platforms_but_not_of_the_tests() {
     let found = dependencies(&manifest.parse().unwrap());
     assert_eq!(found.into_iter().collect::<Vec<_>>(), ["a", "c", "e", "f"]);
 }
+
+/// A file that no module declares is compiled nowhere, and its tests do not run.
+#[test]
+fn every_file_is_declared_as_a_module_or_is_a_root() {
+    let all = rust_files();
+    let text = |path: &str| all.iter().find(|file| file.path == path).map(|file| &*file.text);
+    let roots: BTreeSet<String> = files()
+        .iter()
+        .filter(|file| file.path.ends_with("Cargo.toml"))
+        .flat_map(|file| {
+            let folder = file.path.trim_end_matches("Cargo.toml").to_owned();
+            let named = file.text.lines().filter_map(|line| line.trim().strip_prefix("path = \""));
+            let named: Vec<_> =
+                named.map(|path| folder.clone() + path.trim_end_matches('"')).collect();
+            let usual = ["build.rs", "src/lib.rs", "src/main.rs"].map(|path| folder.clone() + path);
+            named.into_iter().chain(usual)
+        })
+        .collect();
+    let is_declared = |path: &str| {
+        let (folder, name) = path.rsplit_once('/').unwrap_or(("", path));
+        let (folder, module) = match name {
+            "mod.rs" => folder.rsplit_once('/').unwrap_or(("", folder)),
+            _ => (folder, name.trim_end_matches(".rs")),
+        };
+        // Cargo finds these by their folder.
+        if ["/tests", "/examples", "/benches", "/bin"].iter().any(|it| folder.ends_with(it)) {
+            return true;
+        }
+        let declared = format!("mod {module};");
+        let by_path = format!("{name}\"]");
+        let in_folder = all.iter().filter(|file| {
+            file.path
+                .strip_prefix(folder)
+                .and_then(|rest| rest.strip_prefix('/'))
+                .is_some_and(|rest| !rest.contains('/') && file.path != path)
+        });
+        let parent = text(&format!("{folder}.rs"));
+        in_folder.map(|file| &*file.text).chain(parent).any(|text| text.contains(&declared))
+            || all.iter().any(|file| file.text.contains(&by_path))
+    };
+    let orphans = all.iter().filter(|file| !roots.contains(&file.path) && !is_declared(&file.path));
+    none(orphans.map(|file| format!("{} is in no module", file.path)).collect());
+}

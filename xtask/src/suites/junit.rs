@@ -32,6 +32,11 @@ struct JunitTest {
     skipped: Option<JunitCause>,
     #[serde(rename = "system-out")]
     output: Option<JunitOutput>,
+    #[serde(rename = "system-err")]
+    errors: Option<JunitOutput>,
+    /// It failed, and passed when it was repeated.
+    #[serde(rename = "flakyFailure")]
+    flaky: Option<JunitCause>,
 }
 
 #[derive(Deserialize)]
@@ -56,9 +61,10 @@ fn add_text(counts: &mut TestCounts, text: &str) -> Result<(), quick_xml::DeErro
     let report: JunitReport = quick_xml::de::from_str(text)?;
     for test in report.programs.into_iter().flat_map(|program| program.tests) {
         let name = format!("{} {}", test.program, test.name);
-        let output = test.output.map(|output| output.text).unwrap_or_default();
-        let printed = output.lines().find_map(|line| line.strip_prefix("skipped: "));
-        if test.failure.is_some() || test.error.is_some() {
+        let outputs = [&test.output, &test.errors].into_iter().flatten();
+        let mut lines = outputs.flat_map(|output| output.text.lines());
+        let printed = lines.find_map(|line| line.strip_prefix("skipped: "));
+        if test.failure.is_some() || test.error.is_some() || test.flaky.is_some() {
             counts.fail(&name);
         } else if let Some(cause) = test.skipped {
             counts.skip(&name, &cause.message);
@@ -110,12 +116,15 @@ test result: ok. 1 passed; 0 failed; 0 ignored; 0 measured; 6 filtered out; fini
     <testsuite name="nt::slow" tests="2" skipped="0" errors="0" failures="1">
         <testcase name="waits" classname="nt::slow" time="2.012"><failure type="test timeout"/></testcase>
         <testcase name="fine" classname="nt::slow" time="0.1"/>
+        <testcase name="again" classname="nt" time="0.1"><flakyFailure message="x" type="y"/></testcase>
+        <testcase name="late" classname="nt" time="0.1"><system-err>skipped: no server
+</system-err></testcase>
     </testsuite>
 </testsuites>"#,
         );
         assert_eq!(counts.passed, 1);
-        assert_eq!(counts.failed, ["nt abort", "nt::slow waits"]);
-        assert_eq!(counts.skipped, ["nt ok: a < b & c"]);
+        assert_eq!(counts.failed, ["nt abort", "nt::slow waits", "nt again"]);
+        assert_eq!(counts.skipped, ["nt ok: a < b & c", "nt late: no server"]);
     }
 
     #[test]

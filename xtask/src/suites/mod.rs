@@ -194,6 +194,8 @@ fn has_nextest(checkout: &Checkout) -> bool {
 fn nextest(checkout: &Checkout, arguments: &[&str]) -> Suite {
     let mut nextest = checkout.cargo();
     nextest.args(["nextest", "run", "--release"]).args(arguments);
+    // With colours, the lines of tests that it skips begin otherwise.
+    nextest.env("CARGO_TERM_COLOR", "never");
     onnxruntime::pass_to(checkout, &mut nextest);
     let results = checkout.target().join("nextest/default/junit.xml");
     suite("cargo nextest", nextest, SuiteResults::JUnit(results))
@@ -224,9 +226,10 @@ fn rust_tests(checkout: &Checkout) -> Result<Vec<Suite>, Failure> {
         let others = test_programs(checkout)?;
         let others: Vec<_> = others.iter().flat_map(|name| ["--test", name]).collect();
         vec![
+            // First, as it builds examples that the others start.
+            test("units", &["--lib", "--bins", "--examples"]),
             test("programs", &others),
             test("programs in real time", &REAL_TIME.map(|name| ["--test", name]).concat()),
-            test("units", &["--lib", "--bins", "--examples"]),
         ]
     };
     // nextest does not run the examples of the documentation.

@@ -23,7 +23,7 @@ impl NatsServer {
     pub(crate) fn start() -> Option<Self> {
         let program = Path::new("/usr/sbin/nats-server");
         if !program.is_file() {
-            eprintln!("skipped: NATS is not installed (Debian: nats-server)");
+            println!("skipped: NATS is not installed (Debian: nats-server)");
             return None;
         }
         let folder = tempfile::tempdir().unwrap();

@@ -42,7 +42,7 @@ pub async fn store_of(folder: &Path) -> Option<String> {
 /// `except`, with these environment variables. Without PostgreSQL, it prints that and returns.
 pub fn run_again(names: &[&str], except: &str, variables: &[(&str, &str)]) {
     let Some(programs) = programs() else {
-        eprintln!("skipped: PostgreSQL is not installed (Debian: postgresql)");
+        println!("skipped: PostgreSQL is not installed (Debian: postgresql)");
         return;
     };
     let server = PostgresServer::start(&programs);
@@ -54,7 +54,11 @@ pub fn run_again(names: &[&str], except: &str, variables: &[(&str, &str)]) {
     let output = tests.env(STORE, url).envs(variables.iter().copied()).output().unwrap();
     let text = String::from_utf8_lossy(&output.stdout);
     let errors = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success() && text.contains(" passed"), "{text}{errors}");
+    assert!(output.status.success() && !text.contains(" 0 passed"), "{text}{errors}");
+    for name in names {
+        let ran = |line: &str| line.starts_with("test ") && line.contains(name);
+        assert!(text.lines().any(ran), "no test has the name {name}: {text}");
+    }
 }
 
 /// Returns the folder of the newest programs of Debian's package.
