@@ -40,7 +40,7 @@ impl From<Language> for LambdaKind {
 #[derive(Args, Debug, Default)]
 pub struct BuildArgs {
     /// Compile a Rust lambda in a sandbox: its build scripts and macros reach no network and only
-    /// its own files; see docs/security.md
+    /// its own files; also fetch the wheels of a Python lambda in one; see docs/security.md
     #[arg(long)]
     pub sandboxed: bool,
     /// Version of the Python that runs the lambda, such as 3.11, for wheels of its

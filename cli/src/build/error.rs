@@ -1,15 +1,17 @@
 //! Errors of building a lambda, with help for the user.
 
 use std::io;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitStatus;
 
-use gleaner_base::{Exit, Explain, NotPlain};
+use gleaner_base::{Exit, Explain, NotPlain, excerpt};
 use gleaner_lambda::layout::{BUILD_MAX, FILES_MAX};
 use gleaner_lambda::manifest::LambdaKind;
 use gleaner_lambda::{LayoutError, ManifestError};
 use gleaner_parts::PartsError;
 use gleaner_wheels::WheelError;
+
+use super::requirements::RefusedLine;
 
 /// Errors of building a lambda.
 #[derive(Debug, thiserror::Error)]
@@ -31,7 +33,7 @@ pub(super) enum BuildError {
     Compile { status: ExitStatus },
     #[error("cargo ended with {status} in its sandbox; its messages are above")]
     CompileSandboxed { status: ExitStatus },
-    #[error("cargo cannot be sandboxed; the message of gleaner-shim above names the cause")]
+    #[error("the build cannot be sandboxed; the message of gleaner-shim above names the cause")]
     NoSandbox,
     #[error(
         "cannot fetch the dependencies of the lambda: cargo ended with {status}; its messages are \
@@ -51,8 +53,10 @@ pub(super) enum BuildError {
     Parts(PartsError),
     #[error("`{text}` is not the platform of a Python on Linux")]
     Platform { text: String },
-    #[error("pip did not fetch the wheels of `{}`: it ended with {status}", path.display())]
-    Fetched { path: PathBuf, status: ExitStatus },
+    #[error("`{}`, line {}: `{}` {}", path.display(), it.number, excerpt(&it.text), it.reason)]
+    Requirement { path: PathBuf, it: RefusedLine },
+    #[error("pip did not fetch the wheels: it ended with {status}")]
+    Fetched { status: ExitStatus },
     #[error("wheel `{wheel}` has the SHA-256 {sha256}, which `{}` does not list", path.display())]
     Unlocked { wheel: String, sha256: String, path: PathBuf },
     #[error("`{}` locks no numpy, which every Python lambda needs", path.display())]
@@ -77,6 +81,15 @@ pub(super) enum BuildError {
 
 /// Compilation target of a component.
 pub(super) const TARGET: &str = "wasm32-wasip2";
+
+/// Returns a function that makes an error of `action` on `path`.
+pub(super) fn failed(
+    action: &'static str,
+    path: &Path,
+) -> impl Fn(io::Error) -> BuildError + use<> {
+    let path = path.to_owned();
+    move |source| BuildError::File { action, path: path.clone(), source }
+}
 
 impl Explain for BuildError {
     fn help(&self) -> Option<String> {
@@ -132,10 +145,15 @@ impl Explain for BuildError {
                  manylinux_2_28_aarch64; `ldd --version` on the vehicle shows that of its glibc"
                     .to_owned()
             }
+            BuildError::Requirement { .. } => {
+                "write NAME==VERSION --hash=sha256:HEX, as `pip-compile --generate-hashes` and `uv \
+                 pip compile --generate-hashes` do; an index is a setting of the user who builds: \
+                 PIP_INDEX_URL"
+                    .to_owned()
+            }
             BuildError::Fetched { .. } => {
-                "its messages are above; lock each package with version and hashes, for example by \
-                 `pip-compile --generate-hashes requirements.in`; only wheels are used. Without \
-                 pip: install python3-pip, or name a Python that has it: GLEANER_PYTHON"
+                "its messages are above; only wheels are used. Without pip: install python3-pip, \
+                 or name a Python that has it: GLEANER_PYTHON"
                     .to_owned()
             }
             BuildError::Unlocked { .. } => "lock its hashes again, and build again".to_owned(),

@@ -10,7 +10,7 @@ use gleaner_base::PlainFile;
 use gleaner_lambda::layout::{BUILD_MAX, FILES_MAX};
 use gleaner_lambda::{BuildDir, Manifest};
 
-use super::error::BuildError;
+use super::error::{BuildError, failed};
 
 /// An unfinished build, in a folder beside the old one. The folder is hidden, so that its files do
 /// not count as sources if this process is killed. Dropping it before [`finish`](Self::finish)
@@ -120,9 +120,4 @@ fn remove(folder: &Path) -> Result<(), BuildError> {
         }
         _ => Ok(()),
     }
-}
-
-fn failed(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> BuildError {
-    let path = path.to_owned();
-    move |source| BuildError::File { action, path, source }
 }

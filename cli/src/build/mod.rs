@@ -1,7 +1,7 @@
 //! `gleaner build DIR`: builds a lambda's folder `build`, which every other command uses.
 //!
 //! `component` compiles Rust, in a `sandbox` on request. `wheels` fetches the packages of a Python
-//! lambda that has a requirements.txt. `folder` collects the files beside the old
+//! lambda that `requirements` names, by `pip`. `folder` collects the files beside the old
 //! build and then replaces it, so that a failed build leaves the old one unchanged. The files of a
 //! lambda are listed by `gleaner_lambda::Sources`. Nothing here runs a lambda or parses a
 //! component.
@@ -9,6 +9,8 @@
 mod component;
 mod error;
 mod folder;
+mod pip;
+mod requirements;
 mod sandbox;
 mod wheels;
 

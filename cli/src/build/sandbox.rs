@@ -1,5 +1,5 @@
 //! Builds a Rust lambda in a sandbox (`--sandboxed`), since build scripts and macros are code of
-//! its author.
+//! its author. pip, which fetches the wheels of a Python lambda, has the same one, with a network.
 //!
 //! The sandbox lets this code read the toolchain, fetched crates and the workspace of the lambda,
 //! and write into one folder; it denies sockets. Dependencies are fetched before, which runs none
@@ -8,6 +8,7 @@
 //! `gleaner-shim --compiler`.
 
 use std::env;
+use std::ffi::OsStr;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -17,7 +18,7 @@ use gleaner_parts::Parts;
 use serde::Deserialize;
 use sha2::{Digest, Sha256};
 
-use super::error::{BuildError, TARGET};
+use super::error::{BuildError, TARGET, failed};
 
 /// Working directory of cargo.
 const ROOT: &str = "/";
@@ -47,9 +48,7 @@ struct CargoMetadata {
 impl Sandbox {
     /// Checks the workspace of `package`, a `Cargo.toml`, and fetches its dependencies.
     pub(super) fn prepare(package: &Path) -> Result<Self, BuildError> {
-        let shim = Parts::find()
-            .and_then(|parts| parts.program("gleaner-shim"))
-            .map_err(BuildError::Parts)?;
+        let shim = shim()?;
         let home = env::var_os("HOME").map(PathBuf::from).filter(|home| home.is_absolute());
         let home = home.ok_or(BuildError::NoHome)?;
         let sysroot = sysroot(&home)?;
@@ -61,10 +60,10 @@ impl Sandbox {
         // Cargo would follow a link and block on a pipe.
         match lock.symlink_metadata() {
             Ok(found) if found.is_symlink() => {
-                return Err(file("write", &lock)(io::Error::other(NotPlain::Link)));
+                return Err(failed("write", &lock)(io::Error::other(NotPlain::Link)));
             }
             Ok(found) if !found.is_file() => {
-                return Err(file("write", &lock)(io::Error::other(NotPlain::NoFile)));
+                return Err(failed("write", &lock)(io::Error::other(NotPlain::NoFile)));
             }
             _ => {}
         }
@@ -75,9 +74,9 @@ impl Sandbox {
         let sandboxed = all.join("sandboxed");
         let target = sandboxed.join(name);
         for folder in [&all, &sandboxed, &target, &target.join("tmp")] {
-            safe_file::folder(folder).map_err(file("create", folder))?;
+            safe_file::folder(folder).map_err(failed("create", folder))?;
         }
-        let target = target.canonicalize().map_err(file("create", &target))?;
+        let target = target.canonicalize().map_err(failed("create", &target))?;
         let cargo_home =
             env::var_os("CARGO_HOME").map_or_else(|| home.join(".cargo"), PathBuf::from);
         Ok(Self { shim, sysroot, cargo_home, workspace: workspace_root, target })
@@ -108,6 +107,24 @@ impl Sandbox {
             .current_dir(ROOT);
         command
     }
+}
+
+/// Returns the command `python` in the jail of a compiler, but with a network.
+pub(super) fn fetcher(
+    python: &Path,
+    read: &[PathBuf],
+    write: [&Path; 2],
+) -> Result<Command, BuildError> {
+    let mut command = Command::new(shim()?);
+    command.args(["--compiler", "--network"]);
+    command.args(write.into_iter().flat_map(|path| [OsStr::new("--write"), path.as_os_str()]));
+    command.args(read.iter().flat_map(|path| [OsStr::new("--read"), path.as_os_str()]));
+    command.arg("--").arg(python);
+    Ok(command)
+}
+
+fn shim() -> Result<PathBuf, BuildError> {
+    Parts::find().and_then(|parts| parts.program("gleaner-shim")).map_err(BuildError::Parts)
 }
 
 /// Returns the sysroot of the compiler that the user has chosen. Only a toolchain that rustup
@@ -154,7 +171,7 @@ fn metadata(sysroot: &Path, package: &Path) -> Result<CargoMetadata, BuildError>
     if !output.status.success() {
         return Err(BuildError::Compile { status: output.status });
     }
-    serde_json::from_slice(&output.stdout).map_err(|error| file("read", package)(error.into()))
+    serde_json::from_slice(&output.stdout).map_err(|error| failed("read", package)(error.into()))
 }
 
 fn fetch(sysroot: &Path, package: &Path) -> Result<(), BuildError> {
@@ -182,9 +199,4 @@ fn first_line(command: &mut Command) -> io::Result<String> {
     }
     let program = command.get_program().display().to_string();
     Err(io::Error::other(format!("`{program}` ended with {}", output.status)))
-}
-
-fn file(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> BuildError {
-    let path = path.to_owned();
-    move |source| BuildError::File { action, path, source }
 }

@@ -1,14 +1,13 @@
 //! Fetches the wheels that the requirements.txt of a Python lambda locks.
 //!
-//! pip does that, as it resolves platforms, indexes and credentials. It runs no code of a wheel and
-//! builds nothing, and is not that of the lambda's own environment, whose code is untrusted. Each
-//! wheel is then checked as a vehicle will check it. Wheels of the former build are used again if
-//! requirements and target are the same.
+//! `pip` does that, as it resolves platforms, indexes and credentials. It gets only what
+//! `requirements` has read, runs no code of a wheel and builds nothing, and is not that of the
+//! lambda's own environment, whose code is untrusted. Each wheel is then checked as a vehicle will
+//! check it. Wheels of the former build are used again if requirements and target are the same.
 
 use std::fs::{self, File};
 use std::io::{self, ErrorKind};
 use std::path::Path;
-use std::process::{Command, Stdio};
 
 use gleaner_base::text::shell_word;
 use gleaner_base::{PlainFile, hex};
@@ -18,8 +17,9 @@ use gleaner_parts::Parts;
 use gleaner_wheels::WHEELS;
 use sha2::{Digest, Sha256};
 
-use super::error::BuildError;
+use super::error::{BuildError, failed};
 use super::folder::PartialBuild;
+use super::{pip, requirements};
 use crate::args::BuildArgs;
 
 /// Oldest minor version of glibc of which wheels are considered, and names of older ones.
@@ -36,35 +36,26 @@ pub(super) fn add(args: &BuildArgs, partial: &mut PartialBuild) -> Result<(), Bu
         Err(error) if error.kind() == ErrorKind::NotFound => return Ok(()),
         read => read.map_err(failed("read", &path))?,
     };
+    let text = requirements::parse(&text);
+    let text = text.map_err(|it| BuildError::Requirement { path: path.clone(), it })?;
     let python = Parts::find().and_then(|it| it.python(None)).map_err(BuildError::Parts)?;
     let platforms = args.python_platform.as_deref().map_or(Ok(Vec::new()), platforms)?;
     let [version, platform] = [&args.python_version, &args.python_platform]
         .map(|it| it.clone().unwrap_or_else(|| format!("that of {}", python.display())));
-    let mut lock = format!("# version: {version}, platform: {platform}\n").into_bytes();
-    lock.extend(&text);
+    let target = gleaner_base::visible(&format!("# version: {version}, platform: {platform}"));
+    let lock = format!("{target}\n{text}").into_bytes();
 
     let folder = partial.path().join(WHEELS);
     let former = BuildDir::of(&args.lambda);
     fs::create_dir(&folder).map_err(failed("create", &folder))?;
     if !reuse(&former, &lock, &folder).is_ok_and(|is_complete| is_complete) {
         fs::remove_dir_all(&folder).map_err(failed("remove", &folder))?;
-        let mut pip = Command::new(&python);
-        pip.args(["-I", "-m", "pip", "download", "--quiet", "--no-input"])
-            .args(["--disable-pip-version-check", "--require-hashes", "--no-deps"])
-            .args(["--only-binary", ":all:", "--requirement"])
-            .arg(&path)
-            .arg("--dest")
-            .arg(&folder);
-        pip.args(platforms.iter().flat_map(|it| ["--platform", it]));
-        pip.args(args.python_version.iter().flat_map(|it| ["--python-version", it]));
-        // Standard output has the summary of the build.
-        let ended = pip.stdin(Stdio::null()).stdout(io::stderr()).status();
-        let status = ended.map_err(failed("start", &python))?;
-        if !status.success() {
-            return Err(BuildError::Fetched { path, status });
-        }
+        fs::create_dir(&folder).map_err(failed("create", &folder))?;
+        let mut options: Vec<_> = platforms.iter().flat_map(|it| ["--platform", it]).collect();
+        options.extend(args.python_version.iter().flat_map(|it| ["--python-version", it]));
+        pip::download(&python, &text, &options, &folder, args.sandboxed)?;
     }
-    check(&folder, &text, &path, partial)?;
+    check(&folder, text.as_bytes(), &path, partial)?;
     let copy = folder.join(REQUIREMENTS);
     fs::write(&copy, &lock).map_err(failed("write", &copy))?;
     partial.count(lock.len() as u64)
@@ -76,8 +67,9 @@ pub(super) fn note(dir: &Path, build: &BuildDir) -> String {
     if !has_wheels || dir.join(".venv").exists() {
         return String::new();
     }
-    let [venv, pip, lock] =
-        [".venv", ".venv/bin/pip", REQUIREMENTS].map(|it| shell_word(&dir.join(it)));
+    let [venv, pip] = [".venv", ".venv/bin/pip"].map(|it| shell_word(&dir.join(it)));
+    // Not that of the author, which pip would read in its own way.
+    let lock = shell_word(&build.path().join(WHEELS).join(REQUIREMENTS));
     format!(
         "note: the wheels are for vehicles; for `gleaner replay` and `gleaner run` here: python3 \
          -m venv {venv} && {pip} install --require-hashes -r {lock}\n"
@@ -152,11 +144,6 @@ fn platforms(newest: &str) -> Result<Vec<String>, BuildError> {
     let newer = (GLIBC_OLDEST..=minor).rev().map(|minor| format!("manylinux_2_{minor}_{machine}"));
     let older = OLDER_PLATFORMS.iter().map(|older| format!("{older}_{machine}"));
     Ok(newer.chain(older).chain([format!("linux_{machine}")]).collect())
-}
-
-fn failed(action: &'static str, path: &Path) -> impl Fn(io::Error) -> BuildError + use<> {
-    let path = path.to_owned();
-    move |source| BuildError::File { action, path: path.clone(), source }
 }
 
 #[cfg(test)]

@@ -1,4 +1,5 @@
-//! The sandbox of a compiler, which runs code of a lambda's author: build scripts and macros.
+//! The sandbox of a compiler, which runs code of a lambda's author: build scripts and macros; and
+//! of pip, which fetches what the author names.
 //!
 //! A compiler has to start programs, and to change modes and dates of what it writes, so this
 //! sandbox is weaker than that of a lambda's process. The compiler is not started unless every
@@ -51,17 +52,21 @@ const CALLS_HERE: &[i64] = &[];
 const TYPING: [u64; 2] = [libc::TIOCSTI, 0x541C];
 
 /// Restricts this process and its descendants to `paths` and the system's programs and libraries,
-/// without sockets.
+/// without sockets, or with those of the internet only.
 ///
 /// # Errors
 ///
 /// The first layer that does not fully hold on this machine.
-pub fn enter(paths: &Paths) -> Result<(), Layer> {
+pub fn enter(paths: &Paths, has_network: bool) -> Result<(), Layer> {
     let mut layers = base_filter::apply();
-    layers.push(files::confine(paths));
-    layers.push(match filter() {
-        Ok(()) => Layer::yes(sockets::NAME, "seccomp: no new sockets, no connections"),
-        Err(error) => Layer::no(sockets::NAME, error.chain()),
+    let (name, note) = match has_network {
+        true => (sockets::INTERNET_ONLY, "seccomp: no new sockets but those of the internet"),
+        false => (sockets::NAME, "seccomp: no new sockets, no connections"),
+    };
+    layers.push(if has_network { files::confine_client(paths) } else { files::confine(paths) });
+    layers.push(match filter(has_network) {
+        Ok(()) => Layer::yes(name, note),
+        Err(error) => Layer::no(name, error.chain()),
     });
     self_test::verify(layers)
         .into_iter()
@@ -69,8 +74,9 @@ pub fn enter(paths: &Paths) -> Result<(), Layer> {
         .map_or(Ok(()), Err)
 }
 
-fn filter() -> Result<(), JailError> {
-    let mut refused = sockets::none(DeniedCalls::default()).calls(CALLS).calls(CALLS_HERE);
+fn filter(has_network: bool) -> Result<(), JailError> {
+    let deny = if has_network { sockets::internet_only } else { sockets::none };
+    let mut refused = deny(DeniedCalls::default()).calls(CALLS).calls(CALLS_HERE);
     for call in OF_PROCESSES {
         refused = refused.unless(*call, 0, 0);
     }

@@ -5,8 +5,9 @@ use std::path::{Path, PathBuf};
 
 use gleaner_protocol::Layer;
 use landlock::{
-    ABI, Access, AccessFs, AccessNet, CompatLevel, Compatible, LandlockStatus, RestrictionStatus,
-    Ruleset, RulesetAttr, RulesetCreatedAttr, RulesetStatus, Scope, path_beneath_rules,
+    ABI, Access, AccessFs, AccessNet, BitFlags, CompatLevel, Compatible, LandlockStatus,
+    RestrictionStatus, Ruleset, RulesetAttr, RulesetCreatedAttr, RulesetStatus, Scope,
+    path_beneath_rules,
 };
 
 use crate::JailError;
@@ -98,12 +99,20 @@ fn parts_of(program: &Path) -> Vec<(PathBuf, PathBuf)> {
 /// Restricts this thread and its descendants: they can open only `paths` and the system's programs
 /// and libraries.
 pub fn confine(paths: &Paths) -> Layer {
-    layer(NAME, "only the lambda's files; no TCP, no signals to others", restrict(paths))
+    let restricted = restrict(paths, AccessNet::from_all(RULES));
+    layer(NAME, "only the lambda's files; no TCP, no signals to others", restricted)
 }
 
 /// Restricts a program of Gleaner as [`confine`] does.
 pub(crate) fn confine_program(paths: &Paths) -> Layer {
-    layer(NAME, "only the files that it needs; no TCP, no signals to others", restrict(paths))
+    let restricted = restrict(paths, AccessNet::from_all(RULES));
+    layer(NAME, "only the files that it needs; no TCP, no signals to others", restricted)
+}
+
+/// Restricts a program as [`confine`] does, but it can connect by TCP.
+pub(crate) fn confine_client(paths: &Paths) -> Layer {
+    let restricted = restrict(paths, AccessNet::BindTcp.into());
+    layer(NAME, "only the files that it needs; no signals to others", restricted)
 }
 
 /// Restricts this thread and its descendants: they can change only `paths`. Reading is not
@@ -123,13 +132,13 @@ fn restrict_writes(paths: &[PathBuf]) -> Result<RestrictionStatus, JailError> {
         .restrict_self()?)
 }
 
-fn restrict(paths: &Paths) -> Result<RestrictionStatus, JailError> {
+fn restrict(paths: &Paths, denied: BitFlags<AccessNet>) -> Result<RestrictionStatus, JailError> {
     let (read, all) = (AccessFs::from_read(RULES), AccessFs::from_all(RULES));
     Ok(Ruleset::default()
         .set_compatibility(CompatLevel::BestEffort)
         .handle_access(all)?
         // Without a rule that allows a port, none is.
-        .handle_access(AccessNet::from_all(RULES))?
+        .handle_access(denied)?
         .scope(Scope::from_all(RULES))?
         .create()?
         .add_rules(path_beneath_rules(SYSTEM, read))?

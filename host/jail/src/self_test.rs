@@ -4,6 +4,7 @@ use std::fs::File;
 use std::io;
 use std::net::{TcpListener, UdpSocket};
 use std::os::fd::AsFd;
+use std::os::unix::net::UnixDatagram;
 use std::process::Command;
 
 use gleaner_protocol::{Holds, Layer};
@@ -21,6 +22,7 @@ pub fn verify(mut layers: Vec<Layer>) -> Vec<Layer> {
             files::NAME => refused(&File::open("/etc/passwd")),
             files::WRITTEN => refused(&File::options().write(true).open("/dev/full")),
             sockets::NAME => refused(&UdpSocket::bind("127.0.0.1:0")),
+            sockets::INTERNET_ONLY => refused(&UnixDatagram::unbound()),
             sockets::UDP_ONLY => refused(&TcpListener::bind("127.0.0.1:0")),
             sandbox_filter::PROCESSES => refused(&Command::new("/bin/true").spawn()),
             base_filter::NAME => refused(&enter_no_namespace()),

@@ -7,6 +7,8 @@ use crate::filter::{DeniedCalls, install};
 
 /// The name of the layer of a process that creates no sockets.
 pub const NAME: &str = "sockets";
+/// The name of the layer of a process that creates no sockets but those of the internet.
+pub const INTERNET_ONLY: &str = "local sockets";
 /// The name of the layer of a process that creates UDP sockets only.
 pub const UDP_ONLY: &str = "stream sockets";
 
@@ -17,7 +19,7 @@ const CREATING: &[i64] = &[libc::SYS_socket, libc::SYS_bind, libc::SYS_connect];
 /// Calls that send files, and the kernel counts those in flight for all processes of a user.
 const SENDING_FILES: &[i64] = &[libc::SYS_sendmsg, libc::SYS_sendmmsg];
 
-/// Families of sockets that DDS needs: the last one lists the interfaces of the network.
+/// Families of sockets that DDS and pip need: the last one lists the interfaces of the network.
 const FAMILIES: [i32; 3] = [libc::AF_INET, libc::AF_INET6, libc::AF_NETLINK];
 /// Number of socket families: those of Linux, and some to come.
 const ALL_FAMILIES: i32 = 64;
@@ -62,16 +64,22 @@ pub(crate) fn local_listeners_only(refused: DeniedCalls) -> DeniedCalls {
     others.fold(refused, |refused, kind| refused.bits(libc::SYS_socket, 1, TYPE, kind))
 }
 
-/// Denies all new sockets but UDP, and those that list the interfaces of the network.
-pub(crate) fn udp_only(refused: DeniedCalls) -> DeniedCalls {
+/// Denies all new sockets but those of the internet, which connect and do not listen, and those
+/// that list the interfaces of the network.
+pub(crate) fn internet_only(refused: DeniedCalls) -> DeniedCalls {
     let mut refused = pairs_only(refused).calls(ACCEPTING);
     for family in (0..ALL_FAMILIES).filter(|family| !FAMILIES.contains(family)) {
         refused = refused.bits(libc::SYS_socket, 0, ALL, u64::from(family.unsigned_abs()));
     }
-    for kind in OTHER_TYPES {
-        refused = refused.bits(libc::SYS_socket, 1, TYPE, kind);
-    }
     refused
+}
+
+/// Denies, of these sockets, all but UDP.
+pub(crate) fn udp_only(refused: DeniedCalls) -> DeniedCalls {
+    let refused = internet_only(refused);
+    OTHER_TYPES
+        .into_iter()
+        .fold(refused, |refused, kind| refused.bits(libc::SYS_socket, 1, TYPE, kind))
 }
 
 /// Limits pairs of sockets to streams: other kinds can send to any named socket.

@@ -1,8 +1,9 @@
 //! Runs a compiler in the place of a runtime: a build runs code of the lambda's author, in build
-//! scripts and macros.
+//! scripts and macros. With `--network` that is pip.
 
 use std::ffi::OsStr;
 use std::os::unix::process::CommandExt;
+use std::path::Path;
 use std::process::{Command, ExitCode};
 use std::time::Duration;
 
@@ -38,7 +39,13 @@ pub(crate) fn run(args: &Args, signals: Signals) -> Result<ExitCode, Failure> {
     for (flag, paths) in [("--read", &args.read), ("--write", &args.write)] {
         command.args(paths.iter().flat_map(|path| [OsStr::new(flag), path.as_os_str()]));
     }
-    command.arg("--").args(&args.program).env_clear().envs(environment::for_compiler());
+    if args.network {
+        // Its starter has chosen the environment.
+        command.arg("--network");
+    } else {
+        command.env_clear().envs(environment::for_compiler());
+    }
+    command.arg("--").args(&args.program);
     let child = command
         .spawn()
         .map_err(|error| cannot(&format!("cannot start `{}`", shim.display()), &error))?;
@@ -51,8 +58,12 @@ pub(crate) fn run(args: &Args, signals: Signals) -> Result<ExitCode, Failure> {
 
 /// Enters the sandbox and becomes the program. Returns only on errors.
 pub(crate) fn enter(args: &Args) -> Failure {
-    let paths = Paths { read: args.read.clone(), write: args.write.clone() };
-    if let Err(layer) = compiler::enter(&paths) {
+    let (program, arguments) = args.program.split_first().expect("clap asks for a program");
+    let mut paths = Paths { read: args.read.clone(), write: args.write.clone() };
+    if args.network {
+        paths.interpreter(Path::new(program));
+    }
+    if let Err(layer) = compiler::enter(&paths, args.network) {
         let message = format!(
             "this machine cannot sandbox a compiler: `{}` does not hold ({})",
             layer.name, layer.note
@@ -61,7 +72,6 @@ pub(crate) fn enter(args: &Args) -> Failure {
                     trust the lambda's author, without --sandboxed";
         return Failure::new(Exit::Denied, message).with_help(help);
     }
-    let (program, arguments) = args.program.split_first().expect("clap asks for a program");
     let error = Command::new(program).args(arguments).exec();
     Failure::caused_by(
         Exit::Internal,

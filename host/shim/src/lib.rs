@@ -96,6 +96,10 @@ struct Args {
     /// Path that a compiler may read and write.
     #[arg(long, value_name = "PATH", requires = "compiler")]
     write: Vec<PathBuf>,
+    /// Let the compiler, which is then pip in the Python that is started, use the internet and all
+    /// variables.
+    #[arg(long, requires = "compiler")]
+    network: bool,
     /// Run as the compiler's own process.
     #[arg(long, hide = true, requires = "compiler")]
     inside: bool,

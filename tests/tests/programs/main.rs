@@ -21,6 +21,7 @@ mod native;
 mod new;
 mod python_faults;
 mod report;
+mod requirements;
 mod run_drive;
 mod schedule;
 mod scratch;

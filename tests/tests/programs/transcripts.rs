@@ -58,6 +58,8 @@ fn the_page_of_error_messages_is_correct() {
 const RUST: &str = "examples/hello/rust";
 const PYTHON: &str = "examples/hello/python";
 
+const ADDRESS: &str = "# by hand\nsensors @ https://example.com/sensors-1.0.tar.gz\n";
+
 /// Lambdas and drives with one mistake each, by their names on the page.
 fn faulty_lambdas() -> TempFolder {
     let folder = with_drive();
@@ -118,6 +120,9 @@ fn faulty_lambdas() -> TempFolder {
         "python-without-file/lambda.toml",
         manifest.replace("wasm\"", "python\"").replace("hello.python", "main.py"),
     );
+    copy_lambda(PYTHON, &folder, "address", |manifest| manifest);
+    folder.write("address/main.py", "");
+    folder.write("address/requirements.txt", ADDRESS);
     copy_lambda(RUST, &folder, "stale", |manifest| manifest);
     let source = folder.write("stale/src/lib.rs", "");
     let newer = SystemTime::now() + Duration::from_secs(60);

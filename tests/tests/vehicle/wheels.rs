@@ -61,7 +61,7 @@ impl LambdaWithWheels {
         );
         folder.write("lambda/lambda.toml", manifest);
         folder.write("wheels/README", "");
-        let mut lambda = Self { folder, lock: "--no-index\n--find-links ../wheels\n".to_owned() };
+        let mut lambda = Self { folder, lock: String::new() };
         // The host imports it, and needs it for frames and columns only.
         lambda.lock("numpy-0.1-py3-none-any.whl", "numpy.py", "__version__ = '0.1'\n");
         lambda
@@ -86,6 +86,7 @@ impl LambdaWithWheels {
         let path = self.path();
         let path = path.to_str().expect("a plain path");
         let mut build = Command::new(gleaner_tests::program("gleaner"));
+        build.env("PIP_NO_INDEX", "1").env("PIP_FIND_LINKS", self.folder.path().join("wheels"));
         text(&build.arg("build").arg(path).args(args).output().expect("gleaner starts"))
     }
 }
@@ -107,7 +108,10 @@ fn find(folder: &Path, name: &str) -> Option<PathBuf> {
 pub fn runs() {
     let mut lambda = LambdaWithWheels::new("0.1.0");
     lambda.lock("answer-1.0-py3-none-any.whl", "answer.py", "ANSWER = 42.0\n");
-    let built = lambda.build(&[]);
+    let mut built = lambda.build(&["--sandboxed"]);
+    if built.contains("` does not hold (") {
+        built = lambda.build(&[]);
+    }
     assert!(
         built.contains("exit status: 0") && built.contains("note: the wheels are for"),
         "{built}"
