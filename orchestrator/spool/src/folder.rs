@@ -20,6 +20,9 @@ use crate::{SegmentFile, SpoolError, SpoolStorage};
 /// Name of the file that a writer locks.
 const LOCK: &str = "writer.lock";
 
+/// Name of the file with the first number that the consumer may still need, and its checksum.
+const RELEASED: &str = "released";
+
 /// Permissions of the files in the folder.
 const MODE: Mode = Mode::RUSR.union(Mode::WUSR);
 
@@ -249,6 +252,27 @@ impl SpoolStorage for SpoolFolder {
 
     fn sync_names(&self) -> io::Result<()> {
         self.folder.sync_all()
+    }
+
+    fn released(&self) -> io::Result<u64> {
+        let file = match self.open_file(RELEASED, OFlags::RDONLY) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(0),
+            opened => opened?,
+        };
+        let mut bytes = [0; 12];
+        // Nothing was released if a power cut took a part.
+        let read = file.read_exact_at(&mut bytes, 0).map(|()| bytes.split_at(8));
+        let number = |(number, crc): (&[u8], &[u8])| {
+            let is_whole = crc32fast::hash(number).to_le_bytes() == crc;
+            number.try_into().ok().filter(|_| is_whole).map(u64::from_le_bytes)
+        };
+        Ok(read.ok().and_then(number).unwrap_or(0))
+    }
+
+    fn release(&self, before: u64) -> io::Result<()> {
+        let number = before.to_le_bytes();
+        let bytes = [&number[..], &crc32fast::hash(&number).to_le_bytes()].concat();
+        self.open_file(RELEASED, OFlags::WRONLY | OFlags::CREATE)?.write_all_at(&bytes, 0)
     }
 }
 

@@ -55,6 +55,10 @@ pub struct SpoolReader<S: SpoolStorage = SpoolFolder> {
     /// Set if the hole before the next record is due to changed bytes, not to a missing segment.
     damaged: bool,
     reported: Option<TornTail>,
+    /// Set if segments are made durable before they are left.
+    keeps_durable: bool,
+    /// Set if that failed: what was returned may not be on the disk.
+    must_rewind: bool,
 }
 
 struct OpenSegment<F> {
@@ -63,6 +67,10 @@ struct OpenSegment<F> {
     /// First number of the next segment, if there is one. What this segment has from there on is
     /// superseded: its commit failed, and the next segment has it again.
     next_first: Option<u64>,
+    /// Set if it has records that were returned and not made durable since.
+    is_unsynced: bool,
+    /// Set once its name is durable.
+    is_named: bool,
 }
 
 impl<F> std::fmt::Debug for OpenSegment<F> {
@@ -94,7 +102,70 @@ impl<S: SpoolStorage> SpoolReader<S> {
             current: None,
             damaged: false,
             reported: None,
+            keeps_durable: false,
+            must_rewind: false,
         }
+    }
+
+    /// Lets [`sync`](Self::sync) cover all segments: each is made durable before it is left.
+    pub fn keep_durable(&mut self) {
+        self.keeps_durable = true;
+    }
+
+    /// Makes all that was returned durable, also what its writer has not synced yet. Call it
+    /// before records are passed on: a power cut then takes none of them back.
+    ///
+    /// # Errors
+    ///
+    /// [`SpoolError::Read`] if it cannot be made durable. Discard what was returned since the last
+    /// success, and call [`rewind`](Self::rewind): a second sync of a file proves nothing.
+    pub fn sync(&mut self) -> Result<(), SpoolError> {
+        if self.must_rewind {
+            let source = io::Error::other("records that were read could not be made durable");
+            return Err(self.failed(None, source));
+        }
+        let synced = self.sync_current();
+        if synced.is_err() {
+            (self.current, self.must_rewind) = (None, true);
+        }
+        synced
+    }
+
+    fn sync_current(&mut self) -> Result<(), SpoolError> {
+        let Some(current) = self.current.as_mut().filter(|it| it.is_unsynced) else {
+            return Ok(());
+        };
+        let (first, is_named) = (current.first, current.is_named);
+        let names = || if is_named { Ok(()) } else { self.storage.sync_names() };
+        let synced = current.scan.sync().and_then(|()| names());
+        let is_linked = current.scan.is_linked()?;
+        (current.is_unsynced, current.is_named) = (false, true);
+        synced.map_err(|source| self.failed(Some(first), source))?;
+        if !is_linked {
+            self.list()?;
+            // One that the budget removed is not listed.
+            if self.names.binary_search(&first).is_ok() {
+                let source = io::Error::new(io::ErrorKind::NotFound, "it was replaced");
+                return Err(self.failed(Some(first), source));
+            }
+        }
+        Ok(())
+    }
+
+    /// Continues with number `to`, a former [`position`](Self::position).
+    pub fn rewind(&mut self, to: Option<u64>) {
+        (self.expected, self.current, self.reported) = (to, None, None);
+        (self.damaged, self.must_rewind) = (false, false);
+    }
+
+    /// Lets the writer remove segments whose records are all below `before`, without a gap record,
+    /// once it needs the room: the consumer has stored them elsewhere.
+    ///
+    /// # Errors
+    ///
+    /// [`SpoolError::Read`] if that cannot be written.
+    pub fn release(&self, before: u64) -> Result<(), SpoolError> {
+        self.storage.release(before).map_err(|source| self.failed(None, source))
     }
 
     /// Ends the iteration before number `limit`, until the next call. A reader that follows a
@@ -168,13 +239,16 @@ impl<S: SpoolStorage> SpoolReader<S> {
         };
         let scan = SegmentScan::new(file, &self.stream, first);
         let next_first = self.next_segment(first);
-        self.current = Some(OpenSegment { scan, first, next_first });
+        // Its records may have been returned from a file that it replaces.
+        let (is_unsynced, is_named) = (true, false);
+        self.current = Some(OpenSegment { scan, first, next_first, is_unsynced, is_named });
         Ok(())
     }
 
     /// Returns the record, or the gap before it.
     fn item(&mut self, head: &RecordHead, expected: u64) -> Result<SpoolItem, SpoolError> {
         let current = self.current.as_mut().expect("the caller peeked into it");
+        current.is_unsynced = true;
         let damaged = self.damaged || current.scan.damaged;
         let boot = current.scan.header.as_ref().expect("it has records").boot;
         let payload = current.scan.payload()?;
@@ -214,6 +288,9 @@ impl<S: SpoolStorage> SpoolReader<S> {
         let current = self.current.as_ref().expect("the caller peeked into it");
         if let Some(next) = current.next_first {
             self.damaged |= current.scan.torn > 0 || current.scan.damaged;
+            if self.keeps_durable {
+                self.sync()?;
+            }
             self.enter(next)?;
             return Ok(SegmentEnd::Continue);
         }

@@ -51,6 +51,26 @@ pub trait SpoolStorage {
     ///
     /// Those of the file system.
     fn sync_names(&self) -> io::Result<()>;
+
+    /// Returns the first number that the consumer of the stream may still need, of the last
+    /// [`release`](Self::release); 0 without one.
+    ///
+    /// # Errors
+    ///
+    /// Those of the file system.
+    fn released(&self) -> io::Result<u64> {
+        Ok(0)
+    }
+
+    /// Notes that the consumer has stored all records below `before` elsewhere. A power cut may
+    /// take the note.
+    ///
+    /// # Errors
+    ///
+    /// Those of the file system.
+    fn release(&self, _before: u64) -> io::Result<()> {
+        Ok(())
+    }
 }
 
 /// An open segment.

@@ -60,7 +60,7 @@ pub struct SpoolStatus {
     pub disk_bytes: u64,
     /// Records that were refused since the queue was full.
     pub refused: u64,
-    /// Numbers that the budget removed.
+    /// Numbers that the budget removed and the consumer had not released.
     pub removed: u64,
     /// Commits that failed.
     pub failed_commits: u64,
@@ -94,7 +94,8 @@ pub struct SpoolWriter<S: SpoolStorage = SpoolFolder> {
 struct Segment {
     first: u64,
     bytes: u64,
-    /// Number of the gap record that must be durable before the segment is removed.
+    /// Number that must be durable before the segment is removed: that of its gap record, or its
+    /// own first one if its consumer released it.
     removed_by: Option<u64>,
 }
 
@@ -194,6 +195,10 @@ impl<S: SpoolStorage> SpoolWriter<S> {
             }
         }
         self.durable = self.recovered.map_or(self.next, |torn| torn.from);
+        // Numbers that a disk has lost are used again, and were not released.
+        if self.storage.released().is_ok_and(|released| released > self.next) {
+            let _ = self.storage.release(self.durable);
+        }
         Ok(())
     }
 
@@ -281,18 +286,6 @@ impl<S: SpoolStorage> SpoolWriter<S> {
             queued_bytes: self.queue.len(),
             disk_bytes: self.segments.iter().map(Segment::disk_bytes).sum(),
             ..self.counts
-        }
-    }
-
-    /// Removes segments whose records are all below `before`, which their consumer has stored
-    /// elsewhere: this is no loss, and leaves no gap record. A segment that cannot be removed stays
-    /// until the next call.
-    pub fn release(&mut self, before: u64) {
-        while let [oldest, second, ..] = self.segments.make_contiguous() {
-            if second.first > before || !removed(&self.storage, oldest.first) {
-                break;
-            }
-            self.segments.pop_front();
         }
     }
 
@@ -385,6 +378,13 @@ impl<S: SpoolStorage> SpoolWriter<S> {
             to = Some(index);
         }
         let Some(to) = to else { return };
+        // Records that the consumer has stored elsewhere are no loss.
+        let released = self.storage.released().unwrap_or(0);
+        let lost = (from..=to).find(|index| self.segments[index + 1].first > released);
+        for segment in self.segments.range_mut(from..lost.unwrap_or(to + 1)) {
+            segment.removed_by = Some(segment.first);
+        }
+        let Some(from) = lost else { return };
         // The gap record must not come between refused numbers and their own gap record.
         self.mark_refused();
         let (first, last) = (self.segments[from].first, self.segments[to + 1].first - 1);
@@ -395,8 +395,8 @@ impl<S: SpoolStorage> SpoolWriter<S> {
         self.counts.removed += last - first + 1;
     }
 
-    /// Removes the segments whose gap records are durable. One that cannot be removed stays until
-    /// the next commit.
+    /// Removes the marked segments once their gap records are durable. One that cannot be removed
+    /// stays until the next commit.
     fn remove_marked(&mut self) {
         while let Some(Segment { first, removed_by: Some(record), .. }) = self.segments.front() {
             if *record >= self.durable || !removed(&self.storage, *first) {

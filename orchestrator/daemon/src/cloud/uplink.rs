@@ -2,7 +2,8 @@
 //!
 //! Of each stream one batch is on its way at a time, and the next one follows when the cloud has
 //! made it durable. A connection that is lost loses nothing: the next one goes on after the last
-//! record that the cloud has. `collect` decides which records wait for others.
+//! record that the cloud has. A batch is made durable here before it is sent, so that a power cut
+//! takes nothing back that the cloud has. `collect` decides which records wait for others.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -12,7 +13,7 @@ use std::time::{Duration, Instant};
 
 use gleaner_base::{RateLimit, chain};
 use gleaner_fleet::{Ack, Body, Cursor, FRAME_MAX, RECORDS_MAX, Records, compress};
-use gleaner_spool::{SpoolItem, SpoolReader};
+use gleaner_spool::{SpoolError, SpoolFolder, SpoolItem, SpoolReader, SpoolStorage};
 use serde_json::json;
 use tokio::sync::mpsc::Sender;
 
@@ -45,9 +46,14 @@ pub(super) enum UplinkOrder {
     Tail(TailLease),
 }
 
-struct SentStream {
+/// Pause before a stream that could not be opened is tried again.
+const UNREADABLE: Duration = Duration::from_secs(60);
+
+struct SentStream<S: SpoolStorage = SpoolFolder> {
     life: u64,
-    reader: SpoolReader,
+    reader: SpoolReader<S>,
+    /// The position before the collected lines.
+    batched: Option<u64>,
     collected: CollectedLines,
     /// True until all records of the time before the connection are read: they have waited.
     is_behind: bool,
@@ -55,8 +61,8 @@ struct SentStream {
     waits: Option<Batch>,
     /// The number after those that are on their way, and their count.
     on_its_way: Option<(u64, u64)>,
-    /// True once it could not be read.
-    is_unreadable: bool,
+    /// True after a look at which it could not be read or made durable.
+    is_failing: bool,
 }
 
 struct Batch {
@@ -70,6 +76,7 @@ impl Uplink {
     pub(super) fn run(self) {
         let mut streams: BTreeMap<String, SentStream> = BTreeMap::new();
         let (mut rate, mut lease) = (RATE, TailLease::default());
+        let mut unreadable = BTreeMap::new();
         // Times of the next looks: at all streams, and at those that people read.
         let mut all_at = Instant::now();
         let mut live_at = all_at;
@@ -80,9 +87,11 @@ impl Uplink {
                 Ok(UplinkOrder::Ack(ack)) => {
                     let stream = streams.get_mut(&ack.stream).filter(|it| it.life == ack.life);
                     if let Some(stream) = stream
-                        && stream.on_its_way.is_some_and(|(next, _)| ack.next >= next)
+                        && let Some((next, _)) = stream.on_its_way.filter(|it| ack.next >= it.0)
                     {
                         stream.on_its_way = None;
+                        // Without this note, the spool counts more as lost than was.
+                        let _ = stream.reader.release(next);
                         // There may be more.
                         if !self.send(&ack.stream, stream, &mut rate, &lease) {
                             return;
@@ -97,7 +106,7 @@ impl Uplink {
                     let is_of_all = now >= all_at;
                     if is_of_all {
                         all_at = now + INTERVAL;
-                        self.find_new(&mut streams);
+                        self.find_new(&mut streams, &mut unreadable);
                     }
                     let mut due =
                         streams.iter_mut().filter(|(name, _)| is_of_all || lease.has(name, now));
@@ -112,24 +121,32 @@ impl Uplink {
     }
 
     /// Opens streams that did not exist before.
-    fn find_new(&self, streams: &mut BTreeMap<String, SentStream>) {
+    /// `unreadable` has those that could not be opened, with the times of the next tries.
+    fn find_new(
+        &self,
+        streams: &mut BTreeMap<String, SentStream>,
+        unreadable: &mut BTreeMap<String, Instant>,
+    ) {
         for name in names(&self.spool) {
-            if streams.contains_key(&name) {
+            let is_late = |until: &Instant| *until > Instant::now();
+            if streams.contains_key(&name) || unreadable.get(&name).is_some_and(is_late) {
                 continue;
             }
             let folder = self.spool.join(&name);
             let opened = resume(&folder, last_part(&name), self.cursors.get(&name));
-            let Ok((life, reader)) = opened else { continue };
-            let stream = SentStream {
-                life,
-                reader,
-                collected: CollectedLines::default(),
-                is_behind: true,
-                waits: None,
-                on_its_way: None,
-                is_unreadable: false,
+            let (life, reader) = match opened {
+                Ok(opened) => opened,
+                Err(error) => {
+                    // Each look would read all of it.
+                    let error = chain(&error);
+                    tracing::warn!(stream = name, error, "cannot go on with a stream; will retry");
+                    unreadable.insert(name, Instant::now() + UNREADABLE);
+                    continue;
+                }
             };
-            streams.insert(name, stream);
+            // Also back, if the spool has lost records that the cloud has.
+            let _ = reader.release(reader.position().unwrap_or(0));
+            streams.insert(name, SentStream::new(life, reader));
         }
     }
 
@@ -159,22 +176,45 @@ impl Uplink {
     }
 }
 
-impl SentStream {
+impl<S: SpoolStorage> SentStream<S> {
+    fn new(life: u64, mut reader: SpoolReader<S>) -> Self {
+        reader.keep_durable();
+        Self {
+            life,
+            batched: reader.position(),
+            reader,
+            collected: CollectedLines::default(),
+            is_behind: true,
+            waits: None,
+            on_its_way: None,
+            is_failing: false,
+        }
+    }
+
     /// Returns the number of records that are read and that the cloud does not have.
     fn unsent(&self) -> u64 {
         let waiting = self.waits.as_ref().map_or(0, |batch| batch.count);
         self.on_its_way.map_or(0, |(_, count)| count) + waiting + self.collected.count()
     }
 
-    /// Reads the next records; returns those that are due.
+    /// Reads the next records; returns those that are due, once they are durable.
     fn batch(&mut self, name: &str, is_read: bool, now: Instant) -> Option<Batch> {
         let is_at_end = self.collect(last_part(name), now);
-        let is_due = self.is_behind || is_read || self.collected.is_due(now);
+        // Lines that were read before a failure do not wait until it ends.
+        let is_due = self.is_behind || is_read || self.is_failing || self.collected.is_due(now);
         self.is_behind &= !is_at_end;
-        if !is_due {
+        if !is_due || self.collected.count() == 0 {
             return None;
         }
-        let next = self.reader.position()?;
+        if let Err(error) = self.reader.sync() {
+            self.note(name, &error);
+            self.reader.rewind(self.batched);
+            self.collected = CollectedLines::default();
+            return None;
+        }
+        self.is_failing = false;
+        self.batched = self.reader.position();
+        let next = self.batched?;
         let (lines, count) = self.collected.take()?;
         Some(Batch { lines: compress(&lines), count, next })
     }
@@ -182,17 +222,13 @@ impl SentStream {
     /// Reads records up to a whole batch; returns whether there are no more for now.
     fn collect(&mut self, name: &str, now: Instant) -> bool {
         while self.collected.bytes() < BATCH && self.collected.count() < RECORDS_MAX as u64 {
-            if self.is_unreadable {
-                return true;
-            }
             let item = match self.reader.next() {
                 // A commit in progress, or one that a power cut interrupted: a gap follows.
                 None | Some(Ok(SpoolItem::Torn(_))) => return true,
                 Some(item) => item,
             };
             if let Err(error) = &item {
-                tracing::warn!(stream = name, error = chain(error), "a stream cannot be sent");
-                self.is_unreadable = true;
+                self.note(name, error);
                 return true;
             }
             let mut line = line(name, item);
@@ -205,6 +241,14 @@ impl SentStream {
             self.collected.add(&line, &encoded, now);
         }
         false
+    }
+
+    /// Logs a failure, unless the look before it has failed, too.
+    fn note(&mut self, name: &str, error: &SpoolError) {
+        if !self.is_failing {
+            tracing::warn!(stream = name, error = chain(error), "cannot send a stream; will retry");
+        }
+        self.is_failing = true;
     }
 }
 

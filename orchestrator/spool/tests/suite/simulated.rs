@@ -52,6 +52,7 @@ struct Disk {
     random: SpoolRandom,
     operations: u64,
     lists: u64,
+    released: u64,
     fault: Option<DiskFault>,
     /// Segment, and range of its bytes, whose reads fail with `EIO`.
     unreadable: Option<(u64, Range<u64>)>,
@@ -190,6 +191,16 @@ impl SpoolStorage for SimulatedDisk {
         self.operation(false)?;
         let disk = &mut *self.0.borrow_mut();
         disk.durable_names = disk.names.clone();
+        Ok(())
+    }
+
+    fn released(&self) -> io::Result<u64> {
+        self.operation(false)?;
+        Ok(self.0.borrow().released)
+    }
+
+    fn release(&self, before: u64) -> io::Result<()> {
+        self.0.borrow_mut().released = before;
         Ok(())
     }
 }

@@ -1,6 +1,7 @@
-//! A vehicle comes back after seven days: what its spools have arrives once, in order, and what
-//! they lost is named.
+//! A vehicle comes back after seven days, or after a power cut: what its spools have arrives once,
+//! in order, and what they lost is named.
 
+use std::io;
 use std::num::NonZeroU8;
 use std::sync::mpsc;
 
@@ -9,7 +10,7 @@ use gleaner_fleet::decompress;
 use gleaner_lambda::{LogLevel, LogLine};
 use gleaner_protocol::SpooledRecord;
 use gleaner_protocol::vehicle_api::StreamLine;
-use gleaner_spool::{BUDGET_MIN, BootId, SpoolConfig, SpoolError, SpoolTime, SpoolWriter};
+use gleaner_spool::{BUDGET_MIN, BootId, SegmentFile, SpoolConfig, SpoolTime, SpoolWriter};
 use serde_json::Value;
 use tempfile::TempDir;
 use tokio::sync::mpsc::{Receiver as FrameReceiver, channel};
@@ -17,6 +18,11 @@ use tokio::time::timeout;
 
 use super::*;
 use crate::durable::DurableFile;
+use simulated::{DiskFault, SimulatedDisk};
+
+#[expect(dead_code, reason = "the disk of the tests of `gleaner-spool`")]
+#[path = "../../../../spool/tests/suite/simulated.rs"]
+mod simulated;
 
 const DAY_NS: u64 = 86_400_000_000_000;
 /// The first day, in ns since 1970.
@@ -91,12 +97,16 @@ impl Spools {
         }
     }
 
+    fn newest_segment(&self, stream: &str) -> PathBuf {
+        let files = std::fs::read_dir(self.path(stream)).unwrap().map(|it| it.unwrap().path());
+        files.filter(|it| it.extension().is_some_and(|it| it == "seg")).max().unwrap()
+    }
+
     /// Interrupts a commit by a kill.
     fn tear(&mut self, stream: &str) {
         self.writers.remove(stream);
-        let files = std::fs::read_dir(self.path(stream)).unwrap().map(|it| it.unwrap().path());
-        let newest = files.filter(|it| it.extension().is_some_and(|it| it == "seg")).max();
-        let mut segment = std::fs::File::options().append(true).open(newest.unwrap()).unwrap();
+        let newest = self.newest_segment(stream);
+        let mut segment = std::fs::File::options().append(true).open(newest).unwrap();
         std::io::Write::write_all(&mut segment, &[1; 100]).unwrap();
     }
 
@@ -278,4 +288,97 @@ async fn after_seven_days_offline_each_record_arrives_once_in_order_and_losses_a
             _ => assert_eq!((gaps.len(), lost), (0, 0), "{gaps:?}"),
         }
     }
+}
+
+#[tokio::test]
+async fn after_a_power_cut_on_a_disk_that_lies_the_cloud_has_each_record_once() {
+    let (mut vehicle, mut cloud) = (Spools::new(), StoredRecords::default());
+    vehicle.boot(0);
+    for stream in STREAMS_HERE {
+        vehicle.add(stream, 0, 20, 10);
+    }
+    let newest = vehicle.newest_segment("lambdas/moved");
+    let kept = std::fs::read(&newest).unwrap();
+    // Later in the same boot.
+    vehicle.add("lambdas/moved", 1, 100, 50);
+    vehicle.connect(&mut cloud, LinkCut::Never).await;
+
+    // The disk reported them as written.
+    std::fs::write(newest, kept).unwrap();
+    vehicle.boot(1);
+    vehicle.add("lambdas/moved", 2, 120, 60);
+    vehicle.connect(&mut cloud, LinkCut::Never).await;
+    let lines = &cloud.lines["lambdas/moved"];
+    let days = |life: u64| {
+        let lines = lines.iter().filter(move |(it, _)| *it == life);
+        lines.map(|(_, line)| (line.seq, (line.time_ns - BEGIN_NS) / DAY_NS.cast_signed()))
+    };
+    let expected = (0..120_u64).map(|seq| (seq, i64::from(seq >= 20)));
+    assert!(days(1).eq(expected), "{lines:?}");
+    assert!(days(2).eq((20..140_u64).map(|seq| (seq, 2_i64))), "{lines:?}");
+}
+
+#[tokio::test]
+async fn what_the_budget_removes_after_the_cloud_has_it_is_no_gap() {
+    let (mut vehicle, mut cloud) = (Spools::new(), StoredRecords::default());
+    vehicle.boot(0);
+    for day in 0..12 {
+        for stream in STREAMS_HERE {
+            vehicle.add(stream, day, 100, 25);
+        }
+        vehicle.connect(&mut cloud, LinkCut::Never).await;
+    }
+    assert!(vehicle.lines("lambdas/brake", None)[0].seq > 0, "the budget has removed some");
+    let arrived = cloud.of_life("lambdas/brake", 1, 0);
+    assert!(gaps(&arrived).is_empty(), "{:?}", gaps(&arrived));
+    assert!(arrived.iter().map(|line| line.seq).eq(0..1200_u64));
+}
+
+/// Writes ten records in two segments without a sync, as commits in progress. Returns their
+/// stream, and their lines.
+fn unsynced(disk: &SimulatedDisk) -> (SentStream<SimulatedDisk>, Vec<u8>) {
+    let mut vehicle = Spools::new();
+    for number in 0..2 {
+        vehicle.boot(number);
+        vehicle.add("lambdas/brake", 0, 5, 5);
+        let segment = std::fs::read(vehicle.newest_segment("lambdas/brake")).unwrap();
+        disk.create(u64::from(number) * 5).unwrap().append(&segment).unwrap();
+    }
+    (SentStream::new(1, SpoolReader::with_storage(disk.clone(), "brake", None)), lines_on(disk))
+}
+
+/// Returns the lines of all that is on a disk, as they are sent.
+fn lines_on(disk: &SimulatedDisk) -> Vec<u8> {
+    let lines = SpoolReader::with_storage(disk.clone(), "brake", None)
+        .map(|item| serde_json::to_string(&line("brake", item)).unwrap() + "\n");
+    lines.collect::<String>().into_bytes()
+}
+
+#[test]
+fn a_power_cut_takes_nothing_that_was_sent() {
+    for seed in 0..50 {
+        let disk = SimulatedDisk::new(seed);
+        let (mut stream, all) = unsynced(&disk);
+        let sent = stream.batch("lambdas/brake", true, Instant::now()).unwrap();
+        disk.power_cut();
+        assert_eq!((sent.count, sent.next), (10, 10));
+        assert_eq!(decompress(&sent.lines).unwrap(), all);
+        assert_eq!(lines_on(&disk), all, "seed {seed}");
+    }
+}
+
+#[test]
+fn after_an_operation_that_fails_each_record_is_sent_once() {
+    let mut delayed = 0;
+    for at in 1..40 {
+        let disk = SimulatedDisk::new(at);
+        let (mut stream, all) = unsynced(&disk);
+        let (from, kind) = (disk.operations() + at, io::ErrorKind::Other);
+        disk.set_fault(Some(DiskFault { from, count: 1, kind }));
+        let batches = [(); 3].map(|()| stream.batch("lambdas/brake", true, Instant::now()));
+        delayed += u64::from(batches[0].is_none());
+        let sent = batches.iter().flatten().map(|batch| decompress(&batch.lines).unwrap());
+        assert_eq!(sent.collect::<Vec<_>>().concat(), all, "operation {at}");
+    }
+    assert!(delayed >= 3, "failed syncs of both segments and of names");
 }
