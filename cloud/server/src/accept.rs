@@ -22,6 +22,7 @@ use tokio_rustls::TlsAcceptor;
 use tokio_rustls::server::TlsStream;
 
 use crate::clients::{OpenClient, OpenClients};
+use crate::counts::COUNTS;
 
 /// Maximum number of connections that begin at a time, up to the answer to the first request. After
 /// a restart all vehicles come at once: with all of them in progress, each would take longer than
@@ -212,6 +213,7 @@ async fn requests(
         let (answer, open) = (router.call(request), OpenRequest::begin(&peer));
         async move {
             let answer = answer.await?;
+            COUNTS.answered(answer.status().as_u16());
             open.0.end_turn();
             if answer.status() == StatusCode::SWITCHING_PROTOCOLS {
                 // It is in use until it ends.

@@ -6,7 +6,7 @@ use std::io;
 use std::net::IpAddr;
 use std::path::Path;
 use std::sync::Arc;
-use std::time::{Duration, SystemTime};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use gleaner_base::{Exit, Failure, excerpt};
 use gleaner_fleet::CERTIFICATE_NAME;
@@ -31,11 +31,14 @@ const DAY_S: u64 = 86_400;
 const VEHICLE_S: u64 = 30 * DAY_S;
 const RENEW_S: u64 = 20 * DAY_S;
 /// Lifetime of the server's certificate. A server makes one at its start, and then every 30 days.
-const SERVER_S: u64 = 365 * DAY_S;
+/// Vehicles trust no time more than 366 days after their trust root or program, and a root may be
+/// as much ahead itself: also after a clock that was wrong, it must not have expired for them.
+const SERVER_S: u64 = 3 * 366 * DAY_S;
 /// Lifetime of the authorities.
 const AUTHORITY_S: u64 = 20 * 365 * DAY_S;
-/// Time by which certificates begin before they are made: the clock of a vehicle may be behind.
-const BEFORE_S: u64 = 10 * 365 * DAY_S;
+/// Begin of all certificates, in s since 1970: the year 2020. It depends on no clock, as one that
+/// is ahead would make certificates that begin after it is right again.
+const BEGIN_S: u64 = 1_577_836_800;
 
 /// Both authorities.
 pub(crate) struct Authorities {
@@ -170,14 +173,39 @@ impl Authority {
     }
 }
 
-/// Returns the parameters of a certificate that begins before now.
+/// Returns the parameters of a certificate.
 fn params(name: &str, lifetime_s: u64) -> CertificateParams {
-    let now = SystemTime::now();
+    let begin = UNIX_EPOCH + Duration::from_secs(BEGIN_S);
+    // A machine without a battery for its clock begins in 1970, and the authorities stay.
+    let now = SystemTime::now().max(begin);
     let mut params = CertificateParams::default();
     params.distinguished_name = DistinguishedName::new();
     params.distinguished_name.push(DnType::CommonName, name);
-    params.not_before = (now - Duration::from_secs(BEFORE_S)).into();
+    params.not_before = begin.into();
     params.not_after = (now + Duration::from_secs(lifetime_s)).into();
     params.use_authority_key_identifier_extension = true;
     params
+}
+
+#[cfg(test)]
+mod tests {
+    use gleaner_trust::Floors;
+
+    use super::*;
+
+    #[test]
+    fn the_certificate_of_the_cloud_survives_a_clock_that_was_wrong() {
+        let (params, mut floors) = (params("cloud", SERVER_S), Floors::default());
+        assert_eq!(params.not_before.unix_timestamp(), 1_577_836_800);
+        let built = u64::try_from(now()).unwrap();
+        // The signer of the trust root was a year ahead, and then a clock by more.
+        for _ in 0..2 {
+            let anchor = floors.now(0, built);
+            floors.observe(anchor + AUTHORITY_S, anchor);
+        }
+        let expires = u64::try_from(params.not_after.unix_timestamp()).unwrap();
+        // Also just before the next one is made.
+        assert!(expires > floors.now(0, built) + 30 * DAY_S);
+        assert!(floors.now(0, built) >= built + 2 * 366 * DAY_S);
+    }
 }

@@ -25,7 +25,7 @@ use crate::place::FilePlace;
 use crate::readers::Readers;
 use crate::records::ChunkFiles;
 use crate::s3::S3Bucket;
-use crate::store::{ClipBounds, CloudStore, Retention};
+use crate::store::{ClipBounds, CloudStore, Retention, now};
 use crate::{clips, objects, people, records, replicas, tails, vehicles};
 
 /// Maximum number of open connections of people, and of vehicles: a whole fleet has another one
@@ -38,8 +38,10 @@ const PEOPLE_OF_ONE_MAX: u32 = 200;
 const SEEN_INTERVAL: Duration = Duration::from_secs(30);
 /// Interval at which waves of releases are looked at.
 const WAVES_INTERVAL: Duration = Duration::from_secs(2);
-/// Interval at which the server's certificate is made again.
-const CERTIFICATE_INTERVAL: Duration = Duration::from_secs(30 * 86_400);
+/// Time after which the server's certificate is made again, in s, and the interval of looks: a
+/// clock that was set by more has made one with a wrong end.
+const CERTIFICATE_S: i64 = 30 * 86_400;
+const CERTIFICATE_LOOKS: Duration = Duration::from_secs(60);
 
 /// Settings of the server, which are the arguments of `gleaner-cloud serve`.
 #[derive(clap::Args, Debug, Clone)]
@@ -188,6 +190,7 @@ impl CloudServer {
         let (tls, tls_config) = watch::channel(authorities.server_config(&host)?);
         let code = store.invite_first().await?.map(|invitation| invitation.code);
         let cloud = Arc::new(Cloud {
+            health: Default::default(),
             store,
             objects: Objects::new(place(folder.objects(), "objects/")?),
             clips: Arc::new(ClipFiles::new(place(folder.clips(), "clips/")?, ClipBounds::DEFAULT)),
@@ -207,16 +210,15 @@ impl CloudServer {
         });
         let (stop, stopped) = watch::channel(false);
         let (failure, failed) = watch::channel(None);
-        let is_alone = bucket.is_none();
         let mut entrances = JoinSet::new();
-        let is_behind_proxy = options.is_behind_proxy;
-        let entrance = people_entrance(people_listener, &cloud, is_behind_proxy, stopped.clone());
-        entrances.spawn(entrance.serve());
+        let (stopping, behind_proxy) = (stopped.clone(), options.is_behind_proxy);
+        entrances.spawn(people_entrance(people_listener, &cloud, behind_proxy, stopping).serve());
         let entrance = vehicles_entrance(vehicles_listener, &cloud, tls_config, stopped);
         entrances.spawn(entrance.serve());
         // Each has a task of its own: one that waits for the database must not hold it up.
         if cloud.store.is_shared() {
             let working = Arc::clone(&cloud);
+            let is_alone = bucket.is_none();
             chores.spawn(async move { replicas::keep_lease(&working, is_alone, failure).await });
             let working = Arc::clone(&cloud);
             chores.spawn(async move { replicas::follow(&working, hints).await });
@@ -342,9 +344,13 @@ async fn advance_waves(cloud: &Cloud) {
 
 /// Makes the server's certificate again and again, for as long as this process runs.
 async fn renew_certificate(cloud: &Cloud, host: &str, tls: &watch::Sender<Arc<ServerConfig>>) {
-    let mut ticks = ticks(CERTIFICATE_INTERVAL);
+    let (mut ticks, mut made) = (ticks(CERTIFICATE_LOOKS), now());
     loop {
         ticks.tick().await;
+        if (now() - made).abs() < CERTIFICATE_S {
+            continue;
+        }
+        made = now();
         match cloud.authorities.server_config(host) {
             Ok(config) => drop(tls.send_replace(config)),
             Err(failure) => tracing::error!("{failure}"),

@@ -10,13 +10,13 @@ use axum::http::{HeaderMap, StatusCode};
 use axum::response::Response;
 use gleaner_base::{Exit, Failure};
 use gleaner_fleet::clips::{ClipId, ClipPolicy, ClipState, ClipUsage, FleetClip};
-use gleaner_fleet::people::{ListPage, User};
+use gleaner_fleet::people::ListPage;
 
 use super::FileOfClip;
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 use crate::request::parsed;
-use crate::store::ClipQuery;
+use crate::store::{ClipQuery, TokenUser};
 use crate::transfer::{OCTETS, OutgoingFile};
 
 pub(crate) async fn list(
@@ -36,7 +36,7 @@ pub(crate) async fn show(
 /// Marks a clip as wanted. The vehicle sends it when it is connected and has bytes left for today.
 pub(crate) async fn pull(
     State(cloud): State<Arc<Cloud>>,
-    Extension(actor): Extension<User>,
+    Extension(actor): Extension<TokenUser>,
     Path(id): Path<String>,
 ) -> CloudResult<Json<FleetClip>> {
     let id = parse(&id)?;
@@ -46,7 +46,7 @@ pub(crate) async fn pull(
         let parts = cloud.store.clip_parts(&id).await?;
         !cloud.clips.has_recording(&id, &parts).await.map_err(|error| not_sent(&id, error))?
     };
-    let clip = cloud.store.pull_clip(&actor.name, before, is_lost).await?;
+    let clip = cloud.store.pull_clip(&actor.actor, before, is_lost).await?;
     cloud.hub.wake(&[id.vehicle().to_owned()]);
     Ok(Json(clip))
 }
@@ -54,11 +54,11 @@ pub(crate) async fn pull(
 /// Removes a clip. A kill before its files are removed loses nothing: they go with the next look.
 pub(crate) async fn remove(
     State(cloud): State<Arc<Cloud>>,
-    Extension(actor): Extension<User>,
+    Extension(actor): Extension<TokenUser>,
     Path(id): Path<String>,
 ) -> CloudResult<StatusCode> {
     let id = parse(&id)?;
-    cloud.store.remove_clip(&actor.name, &id).await?;
+    cloud.store.remove_clip(&actor.actor, &id).await?;
     super::remove_files_of(&cloud, id).await?;
     Ok(StatusCode::NO_CONTENT)
 }
@@ -103,11 +103,11 @@ pub(crate) async fn policy(State(cloud): State<Arc<Cloud>>) -> CloudResult<Json<
 
 pub(crate) async fn set_policy(
     State(cloud): State<Arc<Cloud>>,
-    Extension(actor): Extension<User>,
+    Extension(actor): Extension<TokenUser>,
     body: Bytes,
 ) -> CloudResult<Json<ClipPolicy>> {
     let policy: ClipPolicy = parsed(&body, "policy of clips")?;
-    let vehicles = cloud.store.set_clip_policy(&actor.name, &policy).await?;
+    let vehicles = cloud.store.set_clip_policy(&actor.actor, &policy).await?;
     cloud.hub.wake(&vehicles);
     Ok(Json(policy))
 }

@@ -21,6 +21,7 @@ use super::text::{self, bytes, count, moment, segment, shown, vehicle_path};
 use crate::clips::{is_thumbnail, people};
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
+use crate::store::TokenUser;
 
 /// The image in the place of a thumbnail that is lost or damaged: a page has no broken image.
 const NO_IMAGE: &str = r##"<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 160 90">
@@ -117,7 +118,8 @@ pub(super) async fn pull(
     Path(id): Path<String>,
 ) -> PageResult {
     let here = clip_path(&parse(&id)?);
-    let _ = people::pull(State(cloud), Extension(user.user), Path(id)).await?;
+    let user = TokenUser::new(user.user, String::new());
+    let _ = people::pull(State(cloud), Extension(user), Path(id)).await?;
     Ok(Redirect::to(&format!("{here}?done=clip")).into_response())
 }
 

@@ -6,12 +6,11 @@
 
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
-use gleaner_fleet::people::User;
 use gleaner_trust::sha256;
 use serde::Serialize;
 
 use crate::error::{CloudError, CloudResult};
-use crate::store::{ChangeAuthor, RequestKey};
+use crate::store::{ChangeAuthor, RequestKey, TokenUser};
 
 /// The header with the key of a request.
 pub(super) const KEY: &str = "idempotency-key";
@@ -57,9 +56,9 @@ impl ChangeConditions {
     }
 
     /// Returns them with the user who makes the change.
-    pub(super) fn by<'c>(&'c self, user: &'c User) -> ChangeAuthor<'c> {
-        let versions = self.versions.as_deref();
-        ChangeAuthor { name: &user.name, key: self.key.as_ref(), versions }
+    pub(super) fn by<'c>(&'c self, user: &'c TokenUser) -> ChangeAuthor<'c> {
+        let (versions, key) = (self.versions.as_deref(), self.key.as_ref());
+        ChangeAuthor { name: &user.actor, user: &user.user.name, key, versions }
     }
 }
 

@@ -8,21 +8,26 @@ use axum::body::{Body, Bytes};
 use axum::extract::{Extension, Path, State};
 use axum::http::{HeaderMap, StatusCode};
 use gleaner_base::Failure;
-use gleaner_fleet::people::{FleetDeployRequest, User};
+use gleaner_fleet::people::{FleetDeployRequest, ReportedRelease};
 use gleaner_lambda::manifest::Sha256;
-use gleaner_protocol::vehicle_api::{DeployReply, GrantStatus};
+use gleaner_protocol::vehicle_api::{
+    DeployReply, DeploymentEnvelopes, GrantStatus, RevisionEnvelope,
+};
 use gleaner_trust::{Refusal, Revision, unverified_deployment, unverified_revision};
 
 use super::conditions::ChangeConditions;
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 use crate::request::{digest, parsed};
-use crate::store::OfferedDeployment;
+use crate::store::{OfferedDeployment, TokenUser};
+
+/// Maximum number of reported releases that are listed.
+const REPORTED_MAX: i64 = 100;
 
 /// Stores a deployment, or answers with the files that are missing for it.
 pub(super) async fn deploy(
     State(cloud): State<Arc<Cloud>>,
-    Extension(actor): Extension<User>,
+    Extension(actor): Extension<TokenUser>,
     headers: HeaderMap,
     body: Bytes,
 ) -> CloudResult<Json<DeployReply>> {
@@ -81,6 +86,30 @@ pub(super) async fn deploy(
     let (generation, changed) = cloud.store.deploy(conditions.by(&actor), &offered).await?;
     cloud.hub.wake(&changed);
     Ok(Json(DeployReply::Accepted { id, attempt: 0, generation }))
+}
+
+/// Returns the signed parts of a deployment, for those who sign the next one.
+pub(super) async fn envelopes(
+    State(cloud): State<Arc<Cloud>>,
+    Path(id): Path<String>,
+) -> CloudResult<Json<DeploymentEnvelopes>> {
+    let deployment = cloud.store.newest_envelope(&id).await?;
+    let wish = unverified_deployment(deployment.as_bytes())
+        .map_err(|error| Failure::because("the stored deployment is damaged", &error))?;
+    let mut revisions = Vec::new();
+    for digest in std::iter::once(&wish.revision).chain(&wish.fallback) {
+        let (revision, envelope) = stored(&cloud, digest).await?;
+        let manifest = cloud.objects.manifest(&revision).await?;
+        revisions.push(RevisionEnvelope { envelope, manifest });
+    }
+    Ok(Json(DeploymentEnvelopes { deployment, revisions }))
+}
+
+pub(super) async fn reported(
+    State(cloud): State<Arc<Cloud>>,
+    Path(id): Path<String>,
+) -> CloudResult<Json<Vec<ReportedRelease>>> {
+    cloud.store.reported_releases(&id, REPORTED_MAX).await.map(Json)
 }
 
 async fn stored(cloud: &Cloud, digest: &Sha256) -> CloudResult<(Revision, String)> {

@@ -17,6 +17,8 @@ pub(crate) struct Endpoint {
     pub(crate) path: &'static str,
     /// The least role; `None` if no token is needed.
     pub(crate) role: Option<Role>,
+    /// True if tokens for programs are refused.
+    pub(crate) needs_login: bool,
     pub(super) summary: &'static str,
     /// The type of its values after `?`.
     pub(super) query: Option<fn(&mut SchemaGenerator) -> Schema>,
@@ -42,6 +44,8 @@ impl MessageShape {
 }
 
 impl Endpoint {
+    /// Creates a request. Changes by an admin give and take access: they need a login, so that
+    /// nothing which a stolen token for programs makes outlives the token.
     pub(super) fn new(
         method: Method,
         path: &'static str,
@@ -49,8 +53,14 @@ impl Endpoint {
         summary: &'static str,
         handler: MethodRouter<Arc<Cloud>>,
     ) -> Self {
-        let (query, takes, gives) = (None, None, None);
-        Self { method, path, role, summary, query, headers: &[], takes, gives, handler }
+        let (query, takes, gives, headers): (_, _, _, &[_]) = (None, None, None, &[]);
+        let needs_login = role == Some(Role::Admin) && method != Method::GET;
+        Self { method, path, role, needs_login, summary, query, headers, takes, gives, handler }
+    }
+
+    /// States that it needs a login.
+    pub(super) fn needs_login(self) -> Self {
+        Self { needs_login: true, ..self }
     }
 
     /// States the type of the values after `?`.

@@ -9,6 +9,7 @@ mod conditions;
 mod deploy;
 mod endpoint;
 mod lists;
+mod metrics;
 mod openapi;
 mod records;
 mod search;
@@ -30,11 +31,11 @@ use gleaner_fleet::Enrolment;
 use gleaner_fleet::clips::{ClipPolicy, ClipUsage, FleetClip};
 use gleaner_fleet::people::{
     AuditEntry, FleetDeployRequest, FleetDeployment, Invitation, ListPage, Login, NewToken,
-    NewUser, NewVehicle, Role, TokenSummary, User, UserToken, VehicleSummary,
+    NewUser, NewVehicle, ReportedRelease, Role, TokenSummary, User, UserToken, VehicleSummary,
 };
 use gleaner_fleet::records::FoundRecords;
 use gleaner_fleet::waves::WaveState;
-use gleaner_protocol::vehicle_api::{DeployReply, StreamLine, VehicleStatus};
+use gleaner_protocol::vehicle_api::{DeployReply, DeploymentEnvelopes, StreamLine, VehicleStatus};
 use serde_json::{Map, Value};
 
 use crate::clients::ClientNetwork;
@@ -66,24 +67,11 @@ const CHANGES: &[&str] = &["If-Match"];
 const READS: &[&str] = &["If-None-Match"];
 const RESUMES: &[&str] = &["Last-Event-ID"];
 
-/// Name of the token of a request; empty for that of a login.
-#[derive(Debug, Clone)]
-struct TokenName(String);
+/// The way out for a token for programs that is refused.
+const LOGIN: &str = "use the token of a login: `gleaner login`";
 
-impl TokenName {
-    /// Refuses a token for programs: if it is stolen, nothing that it makes must outlive its end.
-    fn must_be_login(&self, what: &str) -> CloudResult<()> {
-        match &*self.0 {
-            "" => Ok(()),
-            name => Err(CloudError::denied(
-                format!("token `{name}` {what}"),
-                "use the token of a login: `gleaner login`",
-            )),
-        }
-    }
-}
-
-/// Returns every request that the API answers: no role is stated elsewhere.
+/// Returns every request that the API answers: no role is stated elsewhere, and no need of a login
+/// but that of tokens, of which one for programs removes itself only.
 #[expect(clippy::too_many_lines, reason = "a table of requests, read from top to bottom")]
 pub(crate) fn endpoints() -> Vec<Endpoint> {
     use Role::{Admin, Deployer, Operator, Viewer};
@@ -104,6 +92,10 @@ pub(crate) fn endpoints() -> Vec<Endpoint> {
     vec![
         open(Method::GET, "/v1/openapi.json", "This description", get(openapi::document))
             .gives::<Map<String, Value>>(),
+        open(Method::GET, "/health", "The health of the cloud", get(metrics::health))
+            .gives::<Map<String, Value>>(),
+        read("/metrics", Viewer, "Numbers for Prometheus", get(metrics::metrics))
+            .gives_file("text/plain"),
         open(
             Method::POST,
             "/v1/login",
@@ -123,6 +115,7 @@ pub(crate) fn endpoints() -> Vec<Endpoint> {
         .query::<ListQuery<String>>()
         .gives::<ListPage<TokenSummary>>(),
         send("/v1/tokens", Viewer, "Makes a token for programs", post(tokens::make))
+            .needs_login()
             .headers(CREATES)
             .takes::<NewToken>()
             .gives::<UserToken>(),
@@ -143,6 +136,12 @@ pub(crate) fn endpoints() -> Vec<Endpoint> {
             .takes::<NewVehicle>()
             .gives::<Enrolment>(),
         remove("/v1/vehicles/{name}", Admin, "Cuts a vehicle off", delete(revoke)),
+        send(
+            "/v1/vehicles/{name}/agree",
+            Admin,
+            "Lets a vehicle follow a state that is older than it has followed",
+            post(agree),
+        ),
         read("/v1/vehicles/{name}/status", Viewer, "The last report of a vehicle", get(status))
             .gives::<VehicleStatus>(),
         read("/v1/vehicles/{name}/events", Viewer, "Events of a vehicle", get(records::events))
@@ -179,6 +178,20 @@ pub(crate) fn endpoints() -> Vec<Endpoint> {
         read("/v1/deployments/{id}", Viewer, "A deployment", get(deployment))
             .headers(READS)
             .gives::<FleetDeployment>(),
+        read(
+            "/v1/deployments/{id}/envelopes",
+            Deployer,
+            "The signed parts of a deployment",
+            get(deploy::envelopes),
+        )
+        .gives::<DeploymentEnvelopes>(),
+        read(
+            "/v1/deployments/{id}/reported",
+            Viewer,
+            "The highest releases of a deployment that vehicles have reported",
+            get(deploy::reported),
+        )
+        .gives::<Vec<ReportedRelease>>(),
         send(
             "/v1/deployments/{id}/{change}",
             Operator,
@@ -217,10 +230,13 @@ pub(crate) fn endpoints() -> Vec<Endpoint> {
 /// Returns the routes.
 pub(crate) fn router(cloud: &Arc<Cloud>) -> Router {
     let mut router = Router::new();
-    for Endpoint { path, role, handler, .. } in endpoints() {
+    for Endpoint { path, role, needs_login, handler, .. } in endpoints() {
         let guarded = match role {
             None => handler,
-            Some(role) => handler.route_layer(from_fn_with_state((Arc::clone(cloud), role), guard)),
+            Some(role) => {
+                let state = (Arc::clone(cloud), role, needs_login);
+                handler.route_layer(from_fn_with_state(state, guard))
+            }
         };
         // A file may take its time.
         let is_file = path.starts_with("/v1/objects");
@@ -242,17 +258,20 @@ pub(crate) fn router(cloud: &Arc<Cloud>) -> Router {
         .with_state(Arc::clone(cloud))
 }
 
-/// Lets requests pass whose token is of a user with the role.
+/// Lets requests pass whose token is of a user with the role, and of a login if it has to be.
 async fn guard(
-    State((cloud, role)): State<(Arc<Cloud>, Role)>,
+    State((cloud, role, needs_login)): State<(Arc<Cloud>, Role, bool)>,
     Extension(network): Extension<ClientNetwork>,
     mut request: Request,
     next: Next,
 ) -> Response {
     match user(&cloud, role, network, request.headers()).await {
-        Ok(TokenUser { user, name }) => {
+        Ok(user) if needs_login && !user.name.is_empty() => {
+            let message = format!("token `{}` is for programs, and this needs a login", user.name);
+            CloudError::denied(message, LOGIN).into_response()
+        }
+        Ok(user) => {
             request.extensions_mut().insert(user);
-            request.extensions_mut().insert(TokenName(name));
             next.run(request).await
         }
         Err(error) => error.into_response(),
@@ -309,36 +328,34 @@ async fn login(
     Ok(Json(token))
 }
 
-async fn me(Extension(user): Extension<User>) -> Json<User> {
-    Json(user)
+async fn me(Extension(user): Extension<TokenUser>) -> Json<User> {
+    Json(user.user)
 }
 
 async fn invite(
     State(cloud): State<Arc<Cloud>>,
-    Extension(actor): Extension<User>,
-    Extension(token): Extension<TokenName>,
+    Extension(actor): Extension<TokenUser>,
     headers: HeaderMap,
     body: Bytes,
 ) -> CloudResult<Json<Invitation>> {
     let conditions = ChangeConditions::of_new(&headers, "/v1/users", &body)?;
     let new: NewUser = parsed(&body, "invitation")?;
-    token.must_be_login("invites no users")?;
     Ok(Json(cloud.store.invite(conditions.by(&actor), new).await?))
 }
 
 async fn remove_user(
     State(cloud): State<Arc<Cloud>>,
-    Extension(actor): Extension<User>,
+    Extension(actor): Extension<TokenUser>,
     Path(name): Path<String>,
 ) -> CloudResult<StatusCode> {
-    cloud.store.remove_user(&actor.name, &name).await?;
+    cloud.store.remove_user(&actor.actor, &name).await?;
     cloud.readers.end(&name);
     Ok(StatusCode::NO_CONTENT)
 }
 
 async fn invite_vehicle(
     State(cloud): State<Arc<Cloud>>,
-    Extension(actor): Extension<User>,
+    Extension(actor): Extension<TokenUser>,
     headers: HeaderMap,
     body: Bytes,
 ) -> CloudResult<Json<Enrolment>> {
@@ -363,12 +380,22 @@ pub(crate) async fn enrolment(
     })
 }
 
-async fn revoke(
+async fn agree(
     State(cloud): State<Arc<Cloud>>,
-    Extension(actor): Extension<User>,
+    Extension(actor): Extension<TokenUser>,
     Path(name): Path<String>,
 ) -> CloudResult<StatusCode> {
-    cloud.store.revoke(&actor.name, &name).await?;
+    cloud.store.agree(&actor.actor, &name).await?;
+    cloud.hub.wake(&[name]);
+    Ok(StatusCode::NO_CONTENT)
+}
+
+async fn revoke(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(actor): Extension<TokenUser>,
+    Path(name): Path<String>,
+) -> CloudResult<StatusCode> {
+    cloud.store.revoke(&actor.actor, &name).await?;
     cloud.hub.end(&name, "the vehicle was cut off");
     Ok(StatusCode::NO_CONTENT)
 }
@@ -378,6 +405,7 @@ async fn status(
     Path(name): Path<String>,
 ) -> CloudResult<Response> {
     let status = cloud.store.status(&name).await?;
+    cloud.tails.watch(&name);
     Ok(([(header::CONTENT_TYPE, "application/json")], status).into_response())
 }
 
@@ -417,7 +445,7 @@ pub(crate) async fn change_deployment(
 
 async fn change(
     State(cloud): State<Arc<Cloud>>,
-    Extension(actor): Extension<User>,
+    Extension(actor): Extension<TokenUser>,
     Path((id, change)): Path<(String, String)>,
     headers: HeaderMap,
 ) -> CloudResult<Response> {
@@ -429,7 +457,7 @@ async fn change(
 
 async fn remove_deployment(
     State(cloud): State<Arc<Cloud>>,
-    Extension(actor): Extension<User>,
+    Extension(actor): Extension<TokenUser>,
     Path(id): Path<String>,
     headers: HeaderMap,
 ) -> CloudResult<StatusCode> {

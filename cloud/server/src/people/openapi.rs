@@ -52,7 +52,8 @@ fn describe(endpoints: &[Endpoint]) -> Value {
 }
 
 fn operation(endpoint: &Endpoint, generator: &mut SchemaGenerator) -> Value {
-    let Endpoint { method, path, role, summary, query, headers, takes, gives, .. } = endpoint;
+    let Endpoint { method, path, role, needs_login, summary, query, headers, takes, gives, .. } =
+        endpoint;
     let names = path.split(['{', '}']).skip(1).step_by(2);
     let mut parameters: Vec<Value> = names
         .map(|name| {
@@ -98,7 +99,8 @@ fn operation(endpoint: &Endpoint, generator: &mut SchemaGenerator) -> Value {
         operation["requestBody"] = json!({ "required": true, "content": content });
     }
     if let Some(role) = role {
-        operation["description"] = json!(format!("Needs the role `{role}`."));
+        let login = if *needs_login { ", and the token of a login" } else { "" };
+        operation["description"] = json!(format!("Needs the role `{role}`{login}."));
         operation["security"] = json!([{ "token": [] }]);
     }
     operation

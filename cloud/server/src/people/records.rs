@@ -18,6 +18,7 @@ use tokio::time::sleep;
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 use crate::readers::{ReaderSlot, ReaderToken};
+use crate::store::TokenUser;
 use crate::tails::TailReader;
 
 /// Number of lines in a piece that has none of chunks.
@@ -64,7 +65,7 @@ struct RecordReader {
 
 pub(super) async fn events(
     State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<User>,
+    Extension(TokenUser { user, .. }): Extension<TokenUser>,
     Path(name): Path<String>,
     Query(query): Query<RecordQuery>,
     headers: HeaderMap,
@@ -79,7 +80,7 @@ pub(super) async fn events(
 
 pub(super) async fn lambda(
     State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<User>,
+    Extension(TokenUser { user, .. }): Extension<TokenUser>,
     Path((name, id)): Path<(String, String)>,
     Query(query): Query<RecordQuery>,
     headers: HeaderMap,
@@ -212,7 +213,8 @@ impl RecordReader {
             if index + 1 == lines.len() {
                 text += &format!("id: {}\n", self.arrival);
             }
-            text += &format!("data: {line}\n\n");
+            // Those of earlier versions may have a carriage return, which would end the field.
+            text += &format!("data: {}\n\n", line.replace('\r', " "));
         }
         text
     }

@@ -7,34 +7,33 @@ use axum::body::Bytes;
 use axum::extract::{Extension, Path, Query, State};
 use axum::http::{HeaderMap, StatusCode};
 use gleaner_base::excerpt;
-use gleaner_fleet::people::{ListPage, NewToken, Role, TokenSummary, User, UserToken};
+use gleaner_fleet::people::{ListPage, NewToken, Role, TokenSummary, UserToken};
 
+use super::bearer;
 use super::conditions::ChangeConditions;
-use super::{TokenName, bearer};
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 use crate::request::{ListQuery, parsed};
+use crate::store::TokenUser;
 
 pub(super) async fn make(
     State(cloud): State<Arc<Cloud>>,
-    Extension(actor): Extension<User>,
-    Extension(token): Extension<TokenName>,
+    Extension(actor): Extension<TokenUser>,
     headers: HeaderMap,
     body: Bytes,
 ) -> CloudResult<Json<UserToken>> {
     let conditions = ChangeConditions::of_new(&headers, "/v1/tokens", &body)?;
     let new: NewToken = parsed(&body, "token")?;
-    token.must_be_login("makes no other tokens")?;
-    cloud.account_changes.count(&actor.name)?;
-    Ok(Json(cloud.store.make_token((&actor, conditions.by(&actor)), new).await?))
+    cloud.account_changes.count(&actor.user.name)?;
+    Ok(Json(cloud.store.make_token((&actor.user, conditions.by(&actor)), new).await?))
 }
 
 pub(super) async fn list(
     State(cloud): State<Arc<Cloud>>,
-    Extension(actor): Extension<User>,
+    Extension(actor): Extension<TokenUser>,
     Query(part): Query<ListQuery<String>>,
 ) -> CloudResult<Json<ListPage<TokenSummary>>> {
-    let of = (actor.role < Role::Admin).then_some(&*actor.name);
+    let of = (actor.user.role < Role::Admin).then_some(&*actor.user.name);
     let after = part.after.unwrap_or_default();
     let tokens = cloud.store.tokens(of, &after, part.limit.into()).await?;
     let position = |it: &TokenSummary| format!("{}/{}", it.user, it.name);
@@ -43,31 +42,32 @@ pub(super) async fn list(
 
 pub(super) async fn remove(
     State(cloud): State<Arc<Cloud>>,
-    Extension(actor): Extension<User>,
-    Extension(token): Extension<TokenName>,
+    Extension(actor): Extension<TokenUser>,
     Path((of, name)): Path<(String, String)>,
 ) -> CloudResult<StatusCode> {
-    if (&of, &name) != (&actor.name, &token.0) {
-        token.must_be_login("removes no tokens but itself")?;
+    let TokenUser { user, name: own, actor } = actor;
+    if !own.is_empty() && (&of, &name) != (&user.name, &own) {
+        let message = format!("token `{own}` removes no tokens but itself");
+        return Err(CloudError::denied(message, super::LOGIN));
     }
-    if of != actor.name && actor.role < Role::Admin {
+    if of != user.name && user.role < Role::Admin {
         let message = format!("you have no token `{}/{}`", excerpt(&of), excerpt(&name));
         let help = "remove one of your own, or let an administrator remove it";
         return Err(CloudError::missing(message, help));
     }
-    cloud.store.remove_token(&actor.name, &of, &name).await?;
+    cloud.store.remove_token(&actor, &of, &name).await?;
     cloud.readers.end(&of);
     Ok(StatusCode::NO_CONTENT)
 }
 
 pub(super) async fn logout(
     State(cloud): State<Arc<Cloud>>,
-    Extension(actor): Extension<User>,
+    Extension(actor): Extension<TokenUser>,
     headers: HeaderMap,
 ) -> CloudResult<StatusCode> {
     if let Some(token) = bearer(&headers) {
-        cloud.store.end_token(&actor.name, token).await?;
-        cloud.readers.end(&actor.name);
+        cloud.store.end_token(&actor.actor, token).await?;
+        cloud.readers.end(&actor.user.name);
     }
     Ok(StatusCode::NO_CONTENT)
 }

@@ -88,6 +88,7 @@ async fn pack_stream(cloud: &Cloud, of: (&str, &str), sizes: ChunkSizes) -> Clou
 
 /// Removes records that are too old, and the files of all chunks that are not needed.
 pub(super) async fn remove_old(cloud: &Cloud, grace_s: i64) -> CloudResult<()> {
+    cloud.store.count_age().await?;
     if cloud.keep_records_days > 0 {
         cloud.store.note_arrivals().await?;
         while cloud.store.expire_records(cloud.keep_records_days).await? {}

@@ -3,6 +3,7 @@
 
 use std::time::{Duration, Instant};
 
+use gleaner_base::excerpt;
 use gleaner_fleet::records::{FoundRecord, FoundRecords};
 use gleaner_lambda::{LogLevel, LogLine};
 use gleaner_protocol::vehicle_api::StreamLine;
@@ -31,6 +32,9 @@ const SEARCHED_MAX: u64 = 256 << 10;
 pub(super) static SEARCHES: Semaphore = Semaphore::const_new(2);
 /// Longest text to search for, in bytes.
 const TEXT_MAX: usize = 256;
+/// The kinds of records, with `trigger` and `fault`, which are decisions with these.
+const KINDS: &str = "log, decision, trigger, fault, event, started, summary, ended, lost, omitted, \
+                     gap, torn, damaged, large";
 
 /// The least level of records.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Deserialize, JsonSchema)]
@@ -67,7 +71,7 @@ pub(crate) struct RecordSearch {
     pub(crate) label: Option<String>,
     /// Id of a deployment, whose lambda has the records.
     pub(crate) lambda: Option<String>,
-    /// Kind of the record, such as `log`, `decision` or `event`.
+    /// Kind of the record, such as `log`, `trigger`, `fault` or `event`.
     pub(crate) kind: Option<String>,
     /// Least level of a log line; a decision with a fault has the level `error`.
     pub(crate) level: Option<RecordLevel>,
@@ -141,6 +145,13 @@ impl<'s> RecordFilter<'s> {
             let help = "search for at most 256 bytes";
             return Err(CloudError::usage(message, help));
         }
+        if let Some(kind) = &search.kind
+            && !KINDS.split(", ").any(|it| it == kind)
+        {
+            let message = format!("there are no records of kind `{}`", excerpt(kind));
+            let help = format!("the kinds are {KINDS}");
+            return Err(CloudError::usage(message, &help));
+        }
         let quoted = serde_json::to_string(text).unwrap_or_default();
         let written = quoted.trim_matches('"').to_ascii_lowercase();
         Ok(Self { search, text: text.to_ascii_lowercase(), written })
@@ -170,7 +181,7 @@ impl<'s> RecordFilter<'s> {
             && to_ns.is_none_or(|to| time_ns <= to)
             && (time_ns != 0 || (from_ns.is_none() && to_ns.is_none()));
         is_in_time
-            && kind.as_ref().is_none_or(|kind| line.kind == *kind)
+            && kind.as_ref().is_none_or(|kind| is_of_kind(&line, kind))
             && level >= self.level()
             && (self.text.is_empty() || self.is_in(&line.record))
     }
@@ -182,6 +193,19 @@ impl<'s> RecordFilter<'s> {
             Value::String(text) => text.to_ascii_lowercase().contains(&self.text),
             other => other.to_string().contains(&self.text),
         }
+    }
+}
+
+/// Returns whether a record is of a kind, in the words of the page.
+fn is_of_kind(line: &StreamLine, kind: &str) -> bool {
+    let has = |field: &str| line.record.get(field).is_some_and(|it| !it.is_null());
+    match kind {
+        "fault" => line.kind == "decision" && has("fault"),
+        "trigger" => {
+            let triggers = line.record.get("triggers").and_then(Value::as_array);
+            line.kind == "decision" && triggers.is_some_and(|it| !it.is_empty())
+        }
+        kind => line.kind == kind,
     }
 }
 

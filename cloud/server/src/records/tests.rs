@@ -301,6 +301,8 @@ async fn a_search_finds_records_in_chunks_and_rows_and_goes_on() {
         ("level=warn&lambda=brake&vehicle=car-7", tens),
         ("level=error", vec![]),
         ("kind=decision", vec![]),
+        ("kind=trigger", vec![]),
+        ("kind=fault", vec![]),
         ("from_ns=1098&lambda=brake&kind=log", vec![99, 98]),
         ("to_ns=1001&lambda=brake&limit=1", vec![1, 0]),
         ("text=wheel 3 &label=site=oslo", vec![3, 3]),
@@ -321,6 +323,7 @@ async fn a_search_that_cannot_be_carried_out_is_refused() {
     let long = format!("text={}", "x".repeat(257));
     for (query, reason) in [
         (&*long, "has 257 bytes"),
+        ("kind=foo", "no records of kind `foo`"),
         ("after=x", "no position of a search"),
         ("vehicle=car-9", "no vehicle `car-9`"),
     ] {

@@ -4,9 +4,11 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use gleaner_fleet::{Ack, Cursor};
 
+use super::numbers::{check_life, check_number};
 use super::records::{Retention, StreamBatch};
 use super::writer::{GroupVehicles, VehicleWrite, Waiting, WaitingWrite, counting};
 use super::{CloudStore, StoreChange, in_list, int, list_parts, parts, unsigned};
+use crate::counts::COUNTS;
 use crate::error::{CloudError, CloudResult};
 use crate::sqlx::{self, AssertSqlSafe};
 
@@ -75,7 +77,15 @@ impl CloudStore {
         batch: StreamBatch,
         retention: Retention,
     ) -> CloudResult<Ack> {
-        self.write(AppendWrite { name: name.to_owned(), epoch, batch, retention }).await
+        check_number("`next` of a batch of records", batch.cursor.next)?;
+        // Streams that end at 0 are those that the vehicle has not begun again since a revocation.
+        if batch.cursor.next == 0 {
+            return Err(CloudError::usage("a batch of records ends at 0", "send its records"));
+        }
+        let (name, records) = (name.to_owned(), batch.lines.len() as u64);
+        let ack = self.write(AppendWrite { name, epoch, batch, retention }).await?;
+        COUNTS.records.add(records);
+        Ok(ack)
     }
 }
 
@@ -97,10 +107,12 @@ impl StoredStreams {
     ///
     /// # Errors
     ///
-    /// An error if the life has ended, or the vehicle has too many streams.
+    /// An error if the life has ended or is too large, or the vehicle has too many streams.
     fn begin(&mut self, vehicle: &str, stream: &str, life: u64) -> CloudResult<&mut StoredStream> {
         let VehicleStreams { known, count } = self.0.entry(vehicle.to_owned()).or_default();
-        let is_new = !known.contains_key(stream);
+        let last = known.get(stream).map(|it| it.cursor.life);
+        check_life(stream, last, life)?;
+        let is_new = last.is_none();
         if is_new && *count >= STREAMS_MAX {
             let message = format!("the vehicle has {count} streams; no more are stored");
             return Err(CloudError::usage(message, "deploy under ids that were used before"));
@@ -116,7 +128,8 @@ impl StoredStreams {
             return Err(CloudError::usage(message, "begin the next life of the stream"));
         }
         if stored.cursor.life < life {
-            (stored.cursor.life, stored.cursor.next) = (life, 0);
+            // Records of the life before have nothing to do with it.
+            stored.cursor = Cursor { stream: stream.to_owned(), life, ..Cursor::default() };
         }
         Ok(stored)
     }
@@ -257,7 +270,8 @@ impl StoreChange<'_> {
         names.dedup();
         for part in list_parts(&names) {
             let sql = format!(
-                "SELECT vehicle, COUNT(*) FROM streams WHERE vehicle IN ({}) GROUP BY vehicle",
+                "SELECT vehicle, COUNT(*) FROM streams WHERE vehicle IN ({}) AND next > 0
+                 GROUP BY vehicle",
                 in_list(part.len())
             );
             let query = sqlx::query_as::<_, (String, i64)>(AssertSqlSafe(sql));
@@ -271,6 +285,11 @@ impl StoreChange<'_> {
 
     /// Inserts lines with their arrivals, and adds those that were not there already to their
     /// streams.
+    ///
+    /// # Errors
+    ///
+    /// An error if a record has the number of another one: it would be acknowledged and lost. No
+    /// vehicle sends it, as records before the position are left out.
     async fn insert_lines(
         &mut self,
         lines: &[NewLine<'_>],
@@ -280,10 +299,10 @@ impl StoreChange<'_> {
             let sql = format!(
                 "INSERT INTO records (vehicle, stream, life, seq, mark, arrival, line, bytes)
                  VALUES {} ON CONFLICT (vehicle, stream, life, seq, mark) DO NOTHING
-                 RETURNING vehicle, stream, bytes",
+                 RETURNING vehicle, stream, mark, bytes",
                 self.placeholders(part.len(), 8)
             );
-            let mut query = sqlx::query_as::<_, (String, String, i64)>(AssertSqlSafe(sql));
+            let mut query = sqlx::query_as::<_, (String, String, String, i64)>(AssertSqlSafe(sql));
             for NewLine { vehicle, stream, life, arrival, line: (seq, mark, line) } in part {
                 query = query
                     .bind(*vehicle)
@@ -295,11 +314,19 @@ impl StoreChange<'_> {
                     .bind(line)
                     .bind(int(line.len() as u64));
             }
-            for (vehicle, stream, bytes) in query.fetch_all(&mut *self.tx).await? {
+            let mut others: usize = part.iter().filter(|it| it.line.1.is_empty()).count();
+            for (vehicle, stream, mark, bytes) in query.fetch_all(&mut *self.tx).await? {
+                others -= usize::from(mark.is_empty());
                 if let Some(stored) = streams.get_mut((&vehicle, &stream)) {
                     stored.kept += 1;
                     stored.kept_bytes += bytes;
                 }
+            }
+            if others > 0 {
+                // Alone in its group, it is refused alone.
+                let message = "a record has the number of another one that is stored";
+                let help = "revoke the vehicle, and enrol it again: then its streams begin again";
+                return Err(CloudError::usage(message, help));
             }
         }
         Ok(())

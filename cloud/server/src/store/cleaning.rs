@@ -10,7 +10,7 @@ use gleaner_fleet::clips::{ClipId, ClipState, ClipUsage};
 use gleaner_trust::unverified_revision;
 
 use super::clips::clip_id;
-use super::{CloudStore, StoreChange, int, now, unsigned};
+use super::{CloudStore, StoreChange, int, unsigned};
 use crate::error::{CloudError, CloudResult};
 use crate::sqlx;
 
@@ -60,7 +60,7 @@ impl CloudStore {
         if policy.keep_s == 0 && policy.keep_bytes == 0 {
             return Ok(false);
         }
-        let before = now().saturating_sub(int(policy.keep_s));
+        let before = self.age_now().saturating_sub(int(policy.keep_s));
         let mut change = self.change().await?;
         // Counted in the change: others may have removed some until it began.
         let (kept,): (i64,) = one!(&mut *change.tx;
@@ -135,9 +135,9 @@ impl CloudStore {
         sqlx::query(sqlx::AssertSqlSafe(sql)).execute(&mut *change.tx).await?;
         let sql =
             format!("UPDATE revisions SET unused_since = $1 WHERE unused_since = 0 AND {UNUSED}");
-        sqlx::query(sqlx::AssertSqlSafe(sql)).bind(now()).execute(&mut *change.tx).await?;
+        sqlx::query(sqlx::AssertSqlSafe(sql)).bind(self.age_now()).execute(&mut *change.tx).await?;
         let sql = "DELETE FROM revisions WHERE unused_since > 0 AND unused_since <= $1";
-        let removed = run!(&mut *change.tx; sql; now() - grace_s).rows_affected();
+        let removed = run!(&mut *change.tx; sql; self.age_now() - grace_s).rows_affected();
         if removed > 0 {
             change.note(RULES, "remove revisions", &format!("{removed} without a release")).await?;
         }

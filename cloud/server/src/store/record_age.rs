@@ -1,7 +1,8 @@
 //! Records that are too old. Rows have no time of the cloud: once a day, it notes the last arrival
-//! of each vehicle, and all records up to a note are at least as old as it is.
+//! of each vehicle, and all records up to a note are at least as old as it is. Days are those of
+//! the clock by which records age.
 
-use super::{CloudStore, now};
+use super::CloudStore;
 use crate::error::CloudResult;
 
 const DAY_S: i64 = 86_400;
@@ -11,7 +12,7 @@ const VEHICLES_AT_ONCE: i64 = 100;
 impl CloudStore {
     /// Notes the last arrival of each vehicle, once a day, unless it is that of an earlier note.
     pub(crate) async fn note_arrivals(&self) -> CloudResult<()> {
-        self.note_arrivals_on(now() / DAY_S).await
+        self.note_arrivals_on(self.age_now() / DAY_S).await
     }
 
     pub(crate) async fn note_arrivals_on(&self, day: i64) -> CloudResult<()> {
@@ -35,13 +36,16 @@ impl CloudStore {
     /// whether there may be more. A note of a day may be of its last minute, so that a day counts
     /// once it has been over for that long.
     pub(crate) async fn expire_records(&self, days: u32) -> CloudResult<bool> {
-        let last = now() / DAY_S - i64::from(days) - 1;
+        let last = self.age_now() / DAY_S - i64::from(days) - 1;
         let old: Vec<(String, i64)> = rows!(&self.pool;
             "SELECT vehicle, MAX(arrived) FROM arrival_days WHERE day <= $1
              GROUP BY vehicle ORDER BY vehicle LIMIT $2";
             last, VEHICLES_AT_ONCE);
         for (vehicle, arrived) in &old {
             self.expire_vehicle(vehicle, *arrived, last).await?;
+        }
+        if !old.is_empty() {
+            tracing::info!(vehicles = old.len(), days, "records were removed by their age");
         }
         Ok(old.len() as i64 == VEHICLES_AT_ONCE)
     }

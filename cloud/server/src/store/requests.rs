@@ -21,7 +21,10 @@ pub(crate) struct RequestKey {
 /// The user who makes a change, with the conditions of the request.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct ChangeAuthor<'r> {
+    /// Name in the audit trail.
     pub(crate) name: &'r str,
+    /// Name of the user, of whom the key is.
+    pub(crate) user: &'r str,
     pub(crate) key: Option<&'r RequestKey>,
     /// The versions of the deployment that the change may replace; any without a list.
     pub(crate) versions: Option<&'r [String]>,
@@ -29,7 +32,7 @@ pub(crate) struct ChangeAuthor<'r> {
 
 impl<'r> From<&'r str> for ChangeAuthor<'r> {
     fn from(name: &'r str) -> Self {
-        Self { name, key: None, versions: None }
+        Self { name, user: name, key: None, versions: None }
     }
 }
 
@@ -61,13 +64,13 @@ impl StoreChange<'_> {
         let added = run!(&mut *self.tx;
             "INSERT INTO request_keys (actor, name, request, time) VALUES ($1, $2, $3, $4)
              ON CONFLICT (actor, name) DO NOTHING";
-            author.name, name, request, now());
+            author.user, name, request, now());
         if added.rows_affected() > 0 {
             return Ok(None);
         }
         let (stored, answer): (String, String) = one!(&mut *self.tx;
             "SELECT request, answer FROM request_keys WHERE actor = $1 AND name = $2";
-            author.name, name);
+            author.user, name);
         if stored != *request {
             let message = "another request had the same `Idempotency-Key`";
             let help = "use a new key for each request, and the same one to repeat it";
@@ -90,7 +93,7 @@ impl StoreChange<'_> {
         if let Some(key) = author.key {
             run!(&mut *self.tx;
                 "UPDATE request_keys SET answer = $3 WHERE actor = $1 AND name = $2";
-                author.name, &key.name, answer);
+                author.user, &key.name, answer);
         }
         Ok(())
     }

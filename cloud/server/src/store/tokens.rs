@@ -13,12 +13,25 @@ use crate::error::{CloudError, CloudResult};
 pub(crate) const TOKENS_MAX: i64 = 50;
 
 /// A user with a token, and the rights of that token.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(crate) struct TokenUser {
     /// The user, with the role of the token if that is less.
     pub(crate) user: User,
     /// Name of the token; empty for that of a login.
     pub(crate) name: String,
+    /// Name in the audit trail. No name of a user has a parenthesis.
+    pub(crate) actor: String,
+}
+
+impl TokenUser {
+    /// Returns a user with a token of this name, or with a login or session without one.
+    pub(crate) fn new(user: User, name: String) -> Self {
+        let actor = match name.is_empty() {
+            true => user.name.clone(),
+            false => format!("{} (token {name})", user.name),
+        };
+        Self { user, name, actor }
+    }
 }
 
 impl CloudStore {
@@ -30,7 +43,7 @@ impl CloudStore {
         if !token.is_empty() {
             user.role = user.role.min(role_of(&most)?);
         }
-        Ok(Some(TokenUser { user, name: token }))
+        Ok(Some(TokenUser::new(user, token)))
     }
 
     /// Makes a named token of a user.
@@ -121,8 +134,8 @@ impl CloudStore {
     /// Ends the token of a request.
     pub(crate) async fn end_token(&self, actor: &str, token: &str) -> CloudResult<()> {
         let mut change = self.change().await?;
-        if change.take_secret(SecretKind::Token, token).await?.is_some() {
-            change.note(actor, "logout", actor).await?;
+        if let Some(user) = change.take_secret(SecretKind::Token, token).await? {
+            change.note(actor, "logout", &user).await?;
         }
         change.commit().await
     }

@@ -105,7 +105,7 @@ async fn a_request_with_a_key_has_its_effect_once() {
     assert_eq!((both, entries().await), ([200, 409], before + 3));
     // Without a secret, the answer is the same.
     let key = crate::store::RequestKey { name: "d".to_owned(), request: "digest".to_owned() };
-    let author = ChangeAuthor { name: "ann", key: Some(&key), versions: None };
+    let author = ChangeAuthor { name: "ann", user: "ann", key: Some(&key), versions: None };
     let number = cloud.store.deploy(author, &offered(1)).await.unwrap().0;
     cloud.store.set_wanted("bea", "brake", false).await.unwrap();
     assert_eq!(cloud.store.deploy(author, &offered(1)).await.unwrap(), (number, vec![]));

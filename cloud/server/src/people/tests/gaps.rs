@@ -37,6 +37,25 @@ async fn piece(body: &mut BodyDataStream) -> Vec<Value> {
 }
 
 #[tokio::test]
+async fn a_carriage_return_splits_no_event() {
+    let (_folder, cloud) = cloud().await;
+    let token = token_of(&cloud, "ann", Role::Viewer).await;
+    let epoch = connected(&cloud.store, CAR).await;
+    append(&cloud, epoch, 0..2, 9).await;
+    // As an earlier version has stored it.
+    let update = "UPDATE records SET line = REPLACE(line, ',', $1)";
+    cloud.store.execute_with(update, &[",\r"]).await;
+    let accepts: &[_] = &[("accept", "text/event-stream")];
+    let path = format!("/v1/vehicles/{CAR}/events");
+    let answer = send(&cloud, (Method::GET, &path), Some(&token), accepts, "").await;
+    let text = String::from_utf8(answer.body).unwrap();
+    // A client splits lines at each of both characters.
+    let data = text.split(['\r', '\n']).filter_map(|line| line.strip_prefix("data: "));
+    let seqs = data.map(|it| serde_json::from_str::<Value>(it).unwrap()["seq"].clone());
+    assert_eq!(seqs.collect::<Vec<_>>(), [0, 1]);
+}
+
+#[tokio::test]
 async fn what_is_removed_ahead_of_a_reader_is_counted_by_a_gap() {
     let (_folder, cloud) = cloud().await;
     let token = token_of(&cloud, "ann", Role::Viewer).await;
