@@ -117,7 +117,7 @@ fn deployment(envelope: &[u8]) -> Result<Deployment, Refusal> {
 
 fn on_vehicle<T>(verify: impl FnOnce(&Verifier<'_>) -> T) -> T {
     let (root, floors, labels) = (root(), Floors::default(), Labels::new());
-    verify(&Verifier { root: &root, floors: &floors, labels: &labels, now: 0 })
+    verify(&Verifier { root: &root, floors: &floors, labels: &labels, now: 0, known: &[] })
 }
 
 /// A root with [`KEY`] for all purposes.

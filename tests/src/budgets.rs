@@ -7,22 +7,22 @@
 /// tests.
 pub const LINES: &[(&str, usize, usize)] = &[
     ("base", 1198, 658),
-    ("bench", 11754, 745),
-    ("cli", 10338, 4009),
-    ("cloud", 18091, 5605),
+    ("bench", 11755, 745),
+    ("cli", 11189, 4343),
+    ("cloud", 19046, 6056),
     ("examples", 1318, 757),
     ("fuzz", 4216, 86),
     ("guest-sdk-python", 5876, 4099),
     ("guest-sdk-rust", 5394, 1621),
-    ("host", 62377, 30253),
+    ("host", 62416, 30253),
     ("journal", 1869, 1266),
     ("lambda", 4680, 2183),
-    ("orchestrator", 24163, 7656),
+    ("orchestrator", 24591, 7775),
     ("player", 2242, 793),
     ("report", 2802, 913),
     ("rules", 2707, 1191),
-    ("tests", 6535, 12130),
-    ("xtask", 6962, 607),
+    ("tests", 6532, 12163),
+    ("xtask", 7019, 622),
 ];
 
 /// Files with functions of more than 80 lines, each with its reason.

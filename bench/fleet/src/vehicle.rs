@@ -193,7 +193,7 @@ impl SimulatedVehicle {
     /// do, and reports that they run. Nothing is verified and nothing starts.
     async fn apply(&mut self, socket: &mut Socket, desired: Desired) -> Result<(), String> {
         let simulation = Arc::clone(&self.simulation);
-        let Desired { generation, deployments } = desired;
+        let Desired { generation, deployments, .. } = desired;
         if generation < self.received {
             let Self { identity, received, .. } = self;
             simulation
@@ -285,7 +285,8 @@ pub async fn open(
     let opened =
         tokio_tungstenite::client_async_with_config("ws://cloud/v1/link", stream, Some(config));
     let (mut socket, _) = opened.await.map_err(|error| error.to_string())?;
-    let hello = Hello { protocol: PROTOCOL, version: "0.1.0".to_owned(), key: "key".to_owned() };
+    let (version, key) = ("0.1.0".to_owned(), "key".to_owned());
+    let hello = Hello { protocol: PROTOCOL, version, key, ..Hello::default() };
     send(&mut socket, Body::Hello(hello)).await?;
     match body(socket.next().await)? {
         Some(Body::Welcome(welcome)) => Ok((socket, welcome)),
@@ -329,9 +330,9 @@ fn body(
 
 /// Returns a status as a vehicle reports it, of some 1.5 kB.
 fn status(name: &str, up_s: f64, generation: u64, runs: &[RunningRelease]) -> Value {
-    let deployments = runs.iter().map(|RunningRelease { id, release, revision, .. }| {
+    let deployments = runs.iter().map(|RunningRelease { id, envelope, release, revision }| {
         json!({
-            "id": id, "release": release, "attempt": 1, "lambda": id,
+            "id": id, "release": release, "envelope": envelope, "attempt": 1, "lambda": id,
             "revision": { "digest": revision, "version": "1.0.0", "release": 1 },
             "fallback": null, "grants": { "topics": [], "models": [], "record": false },
             "is_wanted": true, "runs_fallback": false, "is_proven": true, "failed": null,

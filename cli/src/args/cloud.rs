@@ -44,7 +44,7 @@ pub enum CloudCommand {
     /// Connect this vehicle to a cloud
     Enrol(EnrolArgs),
     /// Disconnect this vehicle from its cloud; what runs goes on
-    Unenrol(VehicleArgs),
+    Unenrol(UnenrolArgs),
 }
 
 /// Arguments of the commands without others.
@@ -170,6 +170,15 @@ pub struct VehiclesArgs {
 pub enum VehiclesCommand {
     /// Add a vehicle, and write the file for `gleaner enrol` on it
     Enrol(NewVehicleArgs),
+    /// Print the keys that verify clips, a line for each vehicle, for `gleaner verify --trust`
+    Keys,
+    /// Let a vehicle follow this cloud, which was restored from a backup: it ends what this state
+    /// does not have
+    Agree {
+        /// Name of the vehicle
+        #[arg(value_name = "NAME")]
+        name: VehicleName,
+    },
     /// Cut a vehicle off: it cannot connect again until it is enrolled again
     Revoke {
         /// Name of the vehicle
@@ -204,7 +213,7 @@ pub struct SearchArgs {
     /// Only records of the lambda of this deployment
     #[arg(long, value_name = "ID")]
     pub lambda: Option<String>,
-    /// Only records of this kind, as in log, decision or event
+    /// Only records of this kind, as in log, trigger, fault or event
     #[arg(long, value_name = "KIND")]
     pub kind: Option<String>,
     /// Only log lines of this level or a higher one, and faults: trace, debug, info, warn or error
@@ -241,6 +250,18 @@ pub struct EnrolArgs {
     /// Longest wait for the connection
     #[arg(long, value_name = "DURATION", default_value = "1min", value_parser = parse_duration)]
     pub timeout: Duration,
+    /// The orchestrator
+    #[command(flatten)]
+    pub vehicle: VehicleArgs,
+}
+
+/// Arguments of `gleaner unenrol`.
+#[derive(Args, Debug)]
+pub struct UnenrolArgs {
+    /// Also remove the key of this vehicle, before its disk is copied to others: each copy makes
+    /// its own at its first start
+    #[arg(long)]
+    pub new_identity: bool,
     /// The orchestrator
     #[command(flatten)]
     pub vehicle: VehicleArgs,

@@ -22,8 +22,8 @@ pub use clips::{
 };
 pub use cloud::{
     AuditArgs, CloudCommand, EnrolArgs, ListArgs, LoginArgs, NewTokenArgs, NewVehicleArgs,
-    RemoveArgs, RemoveTokenArgs, SearchArgs, TokensArgs, TokensCommand, UserArgs, UsersArgs,
-    UsersCommand, VehiclesArgs, VehiclesCommand,
+    RemoveArgs, RemoveTokenArgs, SearchArgs, TokensArgs, TokensCommand, UnenrolArgs, UserArgs,
+    UsersArgs, UsersCommand, VehiclesArgs, VehiclesCommand,
 };
 pub use signing::{KeysArgs, KeysCommand, PublishArgs, SignArgs};
 pub use vehicle::{

@@ -49,8 +49,8 @@ pub struct DeployArgs {
     /// Id of the deployment [default: the name of the lambda]
     #[arg(long, value_name = "ID")]
     pub id: Option<String>,
-    /// Number of the release, higher than all before [default: the next one of the
-    /// deployment]
+    /// Number of the release, higher than all before [default: the next one after the signed
+    /// deployment before]
     #[arg(long, value_name = "N")]
     pub release: Option<u64>,
     /// Override a key of the config table, as in brake_mps2=-1.4
@@ -59,10 +59,18 @@ pub struct DeployArgs {
     /// Select only vehicles with this label, as in site=berlin
     #[arg(long, visible_alias = "selector", value_name = "NAME=VALUE", value_parser = super::assignment)]
     pub label: Vec<String>,
-    /// Digest of the revision that runs if this one fails, or `none` [default: the one that runs
-    /// now]
+    /// Digest of the revision that runs if this one fails, or `none` [default: the one of the
+    /// deployment before, or the fallback of that if it has failed]
     #[arg(long, value_name = "SHA256")]
     pub fallback: Option<String>,
+    /// The trust root with the keys of other deployers, of whom one may have signed the deployment
+    /// before this one
+    #[arg(long, value_name = "FILE")]
+    pub trust: Option<PathBuf>,
+    /// Deploy without a question, also if that takes the deployment away from vehicles, or none has
+    /// the labels
+    #[arg(long, requires = "fleet")]
+    pub yes: bool,
     /// Time after which a vehicle no longer accepts the deployment for the first time
     #[arg(long, value_name = "DURATION", default_value = "90d", value_parser = days)]
     pub expires: Duration,
@@ -89,6 +97,9 @@ pub struct ChangeArgs {
     /// Change the deployment of the cloud, on all its vehicles
     #[arg(long, conflicts_with = "run_dir")]
     pub fleet: bool,
+    /// Change it on all these vehicles without a question
+    #[arg(long, requires = "fleet")]
+    pub yes: bool,
     /// The orchestrator
     #[command(flatten)]
     pub vehicle: VehicleArgs,

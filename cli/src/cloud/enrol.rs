@@ -3,12 +3,12 @@
 use std::thread;
 use std::time::{Duration, Instant};
 
-use gleaner_base::{ByteSize, Exit, Failure, PlainFile, format_duration, visible};
+use gleaner_base::{ByteSize, Exit, Failure, PlainFile, format_duration, in_one_line, visible};
 use gleaner_fleet::Enrolment;
 use serde_json::json;
 
 use super::show;
-use crate::args::{EnrolArgs, VehicleArgs};
+use crate::args::{EnrolArgs, UnenrolArgs};
 use crate::render::Paint;
 use crate::vehicle::{self, VehicleClient};
 
@@ -56,14 +56,21 @@ pub(super) fn enrol(args: &EnrolArgs) -> Result<Exit, Failure> {
                 continue;
             }
         };
-        failure.causes = cloud.and_then(|cloud| cloud.reason).into_iter().collect();
+        let reason = cloud.and_then(|cloud| cloud.reason);
+        failure.causes = reason.iter().map(|reason| in_one_line(reason)).collect();
         return Err(failure);
     }
 }
 
-pub(super) fn unenrol(args: &VehicleArgs) -> Result<Exit, Failure> {
-    VehicleClient::new(args)?.delete("/v1/cloud")?;
-    show(args.json, &json!({ "enrolled": false }), |_| {
-        "disconnected from the cloud; what was deployed runs on\n".to_owned()
+pub(super) fn unenrol(args: &UnenrolArgs) -> Result<Exit, Failure> {
+    let UnenrolArgs { new_identity, vehicle } = args;
+    let query = if *new_identity { "?new_identity=true" } else { "" };
+    VehicleClient::new(vehicle)?.delete(&format!("/v1/cloud{query}"))?;
+    let result = json!({ "enrolled": false, "new_identity": new_identity });
+    show(vehicle.json, &result, |_| match new_identity {
+        false => "disconnected from the cloud; what was deployed runs on\n".to_owned(),
+        true => "disconnected from the cloud, and without a key: stop gleaner-orchestrator, and \
+                 copy the disk; each start makes a new key\n"
+            .to_owned(),
     })
 }

@@ -1,16 +1,27 @@
 //! `gleaner fleet`, and the commands with `--fleet`: deployments of a cloud.
 
-use gleaner_base::{Exit, Failure, visible};
-use gleaner_fleet::people::{FleetDeployment, VehicleSummary};
-use gleaner_protocol::vehicle_api::VehicleStatus;
-use gleaner_trust::SecretKey;
-use serde_json::{Value, json};
+use std::thread;
+use std::time::{Duration, Instant};
 
+use gleaner_base::{Exit, Failure, visible};
+use gleaner_fleet::people::{FleetDeployment, ReportedRelease, VehicleSummary};
+use gleaner_report::format::counted;
+use gleaner_trust::SecretKey;
+use hyper::Method;
+use serde_json::json;
+
+use super::plan::{FleetPlan, Selector, selects};
 use super::rollout::{Goal, Rollout};
 use super::{client, list, show, waves};
 use crate::args::{ChangeArgs, DeployArgs, FleetArgs, FleetCommand};
 use crate::render::table;
-use crate::vehicle::{Former, LocalRevision, VehicleClient, deployment, path};
+use crate::vehicle::{
+    Fallback, Former, LocalRevision, VehicleClient, changes, deployment, named_fallback, path,
+    print_lines,
+};
+
+/// Time in which a vehicle that has connected reports its labels.
+const LABELS: Duration = Duration::from_secs(2);
 
 /// A change of a deployment.
 #[derive(Clone, Copy, PartialEq)]
@@ -74,62 +85,102 @@ pub(crate) fn deploy(args: &DeployArgs) -> Result<Exit, Failure> {
     let client = client()?;
     let id = local.id(args);
     let before = deployments(&client)?.into_iter().find(|it| it.id == id);
-    let newest = match &before {
-        Some(before) => before.release,
-        None if args.release.is_some() => 0,
-        None => newest_on_vehicles(&client, &id)?,
+    let of = (&*id, local.lambda());
+    let former = before.as_ref().map(|_| Former::fetch(&client, args, &key, of));
+    let former = former.transpose()?.flatten();
+    // A revision that has failed on a vehicle is no fallback.
+    let failed = before.as_ref().map_or(0, |before| before.failed);
+    let has_failed = failed > 0;
+    let (named, former) = (named_fallback(args)?, former.as_ref());
+    let fallback = Fallback::choose(args, named.as_ref(), (former, has_failed), &local.digest);
+    let labels = args.label.iter().map(|text| text.split_once('=').unwrap_or((text, "")));
+    let selector: Selector =
+        labels.map(|(name, value)| (name.to_owned(), value.to_owned())).collect();
+    let before: Vec<&Selector> = before
+        .iter()
+        .flat_map(|it| std::iter::once(&it.selector).chain(&it.older_selectors))
+        .collect();
+    let (plan, vehicles) = plan(&client, &before, &selector)?;
+    let reported: Vec<ReportedRelease> = client.get(&format!("{}/reported", path(&id)?))?;
+    // Others do not get it.
+    let is_chosen = |it: &&ReportedRelease| {
+        vehicles.iter().any(|vehicle| vehicle.name == it.vehicle && selects(&selector, vehicle))
     };
-    let former = before.as_ref().map(|before| {
-        // A revision that has failed on a vehicle is no fallback.
-        let fallback = before.fallback.as_ref().filter(|_| before.failed > 0);
-        Former { runs: Some(fallback.unwrap_or(&before.revision)), grants: &before.grants }
-    });
-    let deployment = deployment(args, &local, &id, former, newest)?;
-    local.deploy(&client, args, &deployment, &key)?;
-    let selector = deployment.selector.iter();
-    let selector = selector.map(|(name, value)| (name.to_string(), value.clone())).collect();
+    let reported = reported.iter().find(is_chosen);
+    let deployment = deployment(args, &local, &id, (former, fallback), reported)?;
+    let json = args.vehicle.json;
+    if !json {
+        let mut lines = changes(&deployment, former, fallback);
+        if has_failed && args.fallback.is_none() {
+            lines[0] += &format!(", as the one before failed on {}", counted(failed, "vehicle"));
+        }
+        print_lines(&lines)?;
+    }
+    plan.confirm(&id, &selector, (args.yes, json))?;
+    let envelope = local.deploy(&client, args, &deployment, &key)?.envelope;
     let release = deployment.release;
-    if args.waves.plan().is_some() && !waves::wait(&client, &id, release, args)? {
+    if args.waves.plan().is_some() && !waves::wait(&client, &id, &envelope, args)? {
         return Ok(Exit::Ok);
     }
     let goal = Goal::Revision { release };
-    Rollout { id, selector, goal }.wait(&client, args.vehicle.json, args.timeout)
+    let rollout = Rollout { id, selector, envelope: Some(envelope), goal, plan };
+    rollout.wait(&client, json, args.timeout)
+}
+
+/// Returns the plan of a deployment. A vehicle that has just connected reports its labels a moment
+/// later: that is waited for if no vehicle matches.
+fn plan(
+    client: &VehicleClient,
+    before: &[&Selector],
+    selector: &Selector,
+) -> Result<(FleetPlan, Vec<VehicleSummary>), Failure> {
+    let started = Instant::now();
+    loop {
+        let vehicles: Vec<VehicleSummary> = list::all(client, "/v1/vehicles", &[])?;
+        let plan = FleetPlan::of_deployment(&vehicles, before, selector);
+        if plan.matches_any() || vehicles.is_empty() || started.elapsed() >= LABELS {
+            return Ok((plan, vehicles));
+        }
+        thread::sleep(LABELS / 10);
+    }
 }
 
 /// Runs `gleaner rollback`, `start`, `stop` and `remove` with `--fleet`.
 pub(crate) fn change(args: &ChangeArgs, change: Change) -> Result<Exit, Failure> {
     let (path, client) = (path(&args.id)?, client()?);
     let found = deployments(&client)?.into_iter().find(|it| it.id == args.id);
-    let FleetDeployment { id, selector, .. } = found.ok_or_else(|| {
-        Failure::new(Exit::Usage, format!("the cloud has no deployment `{}`", args.id))
-            .with_help("`gleaner fleet` lists them")
-    })?;
-    let post =
-        |change: &str| client.post::<Value>(&format!("{path}/{change}"), &json!({})).map(drop);
+    let FleetDeployment { id, selector, older_selectors, envelope, waves, version, .. } = found
+        .ok_or_else(|| {
+            Failure::new(Exit::Usage, format!("the cloud has no deployment `{}`", args.id))
+                .with_help("`gleaner fleet` lists them")
+        })?;
+    let vehicles: Vec<VehicleSummary> = list::all(&client, "/v1/vehicles", &[])?;
+    let removal = if change == Change::Remove { "is removed from" } else { "stops on" };
+    let plan = match change {
+        Change::Stop | Change::Remove => {
+            let had: Vec<_> = std::iter::once(&selector).chain(&older_selectors).collect();
+            FleetPlan::of_removal(&vehicles, &had, removal)
+        }
+        Change::Rollback | Change::Start => FleetPlan::default(),
+    };
+    if matches!(change, Change::Stop | Change::Remove) {
+        plan.confirm(&id, &selector, (args.yes, args.vehicle.json))?;
+    }
+    // What was planned is changed, and nothing that came since.
+    let version = (!version.is_empty()).then_some(version);
+    let post = |change: &str| client.change(Method::POST, &format!("{path}/{change}"), &version);
     let goal = match change {
         Change::Rollback => post("rollback").map(|()| Goal::Fallback),
         Change::Start => post("start").map(|()| Goal::Running),
         Change::Stop => post("stop").map(|()| Goal::Stopped),
-        Change::Remove => client.delete(&path).map(|()| Goal::Removed),
+        Change::Remove => client.change(Method::DELETE, &path, &version).map(|()| Goal::Removed),
     };
-    Rollout { id, selector, goal: goal? }.wait(&client, args.vehicle.json, args.timeout)
+    // In waves, vehicles run different ones.
+    let envelope = Some(envelope).filter(|it| waves.is_none() && !it.is_empty());
+    let rollout = Rollout { id, selector, envelope, goal: goal?, plan };
+    rollout.wait(&client, args.vehicle.json, args.timeout)
 }
 
 pub(super) fn deployments(client: &VehicleClient) -> Result<Vec<FleetDeployment>, Failure> {
     list::all(client, "/v1/deployments", &[])
-}
-
-/// Returns the newest release of a deployment that a vehicle has or had. It accepts only later
-/// ones.
-fn newest_on_vehicles(client: &VehicleClient, id: &str) -> Result<u64, Failure> {
-    let vehicles: Vec<VehicleSummary> = list::all(client, "/v1/vehicles", &[])?;
-    let release = |status: VehicleStatus| {
-        let deployments = status.deployments.into_iter().filter(|it| it.id == id);
-        deployments.map(|it| it.release).chain(status.removed.get(id).copied()).max()
-    };
-    // One that has not reported yet has no status.
-    let statuses = vehicles
-        .iter()
-        .filter_map(|vehicle| client.get(&format!("/v1/vehicles/{}/status", vehicle.name)).ok());
-    Ok(statuses.filter_map(release).max().unwrap_or(0))
 }

@@ -4,7 +4,8 @@
 //!   programs.
 //! - `vehicles`: lists, enrols and revokes vehicles. `enrol`: connects this one.
 //! - `clips`: lists and fetches recorded clips.
-//! - `fleet`: deployments of the cloud, signed here. `rollout`: waits for all their vehicles, and
+//! - `fleet`: deployments of the cloud, signed here. `plan`: the vehicles that a change concerns,
+//!   and the question before it. `rollout`: waits for all their vehicles, and
 //!   `waves` for the waves before.
 //! - `list`: lists, part by part. `search`: what is found in records.
 
@@ -14,6 +15,7 @@ mod fleet;
 mod list;
 mod login;
 mod people;
+mod plan;
 mod rollout;
 mod search;
 mod tokens;

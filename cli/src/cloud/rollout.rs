@@ -5,12 +5,14 @@ use std::thread;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use gleaner_base::{Exit, Failure, visible};
+use gleaner_fleet::WantedProblem;
 use gleaner_fleet::people::{VehicleState, VehicleSummary};
 use gleaner_protocol::supervision::LambdaPhase;
 use gleaner_protocol::vehicle_api::VehicleStatus;
 use gleaner_report::format::counted;
 use serde_json::json;
 
+use super::plan::{FleetPlan, Selector, selects};
 use super::{list, vehicles};
 use crate::render::json_line;
 use crate::stdout::print;
@@ -27,9 +29,13 @@ pub(super) struct Rollout {
     /// Id of the deployment.
     pub(super) id: String,
     /// Labels of its vehicles.
-    pub(super) selector: BTreeMap<String, String>,
+    pub(super) selector: Selector,
+    /// SHA-256 of the signed envelope that runs then; `None` if there may be several.
+    pub(super) envelope: Option<String>,
     /// The state that each should reach.
     pub(super) goal: Goal,
+    /// The vehicles that it concerns; those that match meanwhile count, too.
+    pub(super) plan: FleetPlan,
 }
 
 /// The state of a deployment that a change requests.
@@ -97,7 +103,7 @@ impl Rollout {
         loop {
             let vehicles: Vec<VehicleSummary> = list::all(client, "/v1/vehicles", &[])?;
             let mut former = std::mem::take(&mut standings);
-            for vehicle in vehicles.iter().filter(|vehicle| self.selects(vehicle)) {
+            for vehicle in vehicles.iter().filter(|vehicle| self.concerns(vehicle)) {
                 let standing = match former.remove(&vehicle.name).filter(Standing::is_done) {
                     Some(done) => done,
                     None => {
@@ -119,11 +125,14 @@ impl Rollout {
         }
     }
 
-    /// Returns whether the deployment is for a vehicle. The labels of one that has never connected
-    /// are unknown.
-    fn selects(&self, vehicle: &VehicleSummary) -> bool {
-        matches!(vehicle.state, VehicleState::Online | VehicleState::Offline)
-            && self.selector.iter().all(|(name, value)| vehicle.labels.get(name) == Some(value))
+    fn concerns(&self, vehicle: &VehicleSummary) -> bool {
+        selects(&self.selector, vehicle) || self.plan.names(&vehicle.name)
+    }
+
+    /// Returns the state that a vehicle should reach.
+    fn goal_of(&self, vehicle: &VehicleSummary) -> Goal {
+        let is_removal = self.plan.removes(&vehicle.name) && self.goal != Goal::Stopped;
+        if is_removal { Goal::Removed } else { self.goal }
     }
 
     fn standing(
@@ -135,7 +144,7 @@ impl Rollout {
             Standing::Pending("it has not handled the change yet".to_owned())
         } else {
             match client.get(&format!("/v1/vehicles/{}/status", vehicle.name)) {
-                Ok(status) => self.judge(&status, &vehicle.problems),
+                Ok(status) => self.judge(self.goal_of(vehicle), &status, &vehicle.problems),
                 Err(failure) if [Exit::Unreachable, Exit::Denied].contains(&failure.exit) => {
                     return Err(failure);
                 }
@@ -154,26 +163,35 @@ impl Rollout {
     }
 
     /// Compares a status, and the problems with the wanted state, with the goal.
-    fn judge(&self, status: &VehicleStatus, problems: &[String]) -> Standing {
+    fn judge(&self, goal: Goal, status: &VehicleStatus, problems: &[WantedProblem]) -> Standing {
         let pending = |text: &str| Standing::Pending(text.to_owned());
-        let standing = match self.goal {
+        let standing = match goal {
             Goal::Stopped | Goal::Removed => {
                 let found = status.deployments.iter().find(|it| it.id == self.id);
-                let is_applied = found.is_none_or(|it| self.goal == Goal::Stopped && !it.is_wanted);
+                let is_applied = found.is_none_or(|it| goal == Goal::Stopped && !it.is_wanted);
                 let lambdas = status.supervisor.as_ref().map(|supervisor| &supervisor.lambdas);
                 match lambdas.map(|lambdas| lambdas.iter().any(|it| it.id == self.id)) {
                     _ if !is_applied => pending("it has not followed the change yet"),
-                    Some(false) => Standing::Done(self.goal.in_words().to_owned()),
+                    Some(false) => Standing::Done(goal.in_words().to_owned()),
                     Some(true) => pending("its lambda still ends"),
                     None => pending("its supervisor does not report"),
                 }
             }
             _ => self.judge_running(status),
         };
-        let mine = format!("`{}`", self.id);
-        match (standing, problems.iter().find(|problem| problem.contains(&mine))) {
+        // Those of a former deployment of this id are of another envelope.
+        let mut mine = problems.iter().filter(|problem| {
+            let is_same = |envelope: &String| *envelope == problem.envelope;
+            problem.deployment == self.id
+                && (problem.envelope.is_empty() || self.envelope.as_ref().is_none_or(is_same))
+        });
+        match (standing, mine.next()) {
             (Standing::Pending(_), Some(problem)) => {
-                Standing::Failed(Exit::Denied, visible(problem))
+                let reason = problem.in_words();
+                match problem.is_pending {
+                    true => Standing::Pending(reason),
+                    false => Standing::Failed(Exit::Denied, reason),
+                }
             }
             (standing, _) => standing,
         }
@@ -184,13 +202,17 @@ impl Rollout {
         let Some(it) = status.deployments.iter().find(|it| it.id == self.id) else {
             return pending("it does not have the deployment yet");
         };
-        if let Goal::Revision { release } = self.goal {
-            let text = format!("it has release {}", it.release);
-            match it.release.cmp(&release) {
-                std::cmp::Ordering::Less => return Standing::Pending(text),
-                std::cmp::Ordering::Greater => return Standing::Failed(Exit::Differs, text),
-                std::cmp::Ordering::Equal => {}
-            }
+        if it.envelope.is_empty() && self.envelope.is_some() {
+            return pending("its gleaner is too old to state what it runs: update it");
+        }
+        if self.envelope.as_ref().is_some_and(|envelope| *envelope != it.envelope) {
+            let text = format!("it has another deployment, with release {}", it.release);
+            return match self.goal {
+                Goal::Revision { release } if it.release > release => {
+                    Standing::Failed(Exit::Differs, text)
+                }
+                _ => Standing::Pending(text),
+            };
         }
         if let Some(refused) = &it.refused {
             return Standing::Failed(Exit::Denied, format!("it refuses it: {}", visible(refused)));
@@ -221,7 +243,7 @@ impl Rollout {
                 Standing::Failed(Exit::LambdaFaulted, text)
             }
             Some(phase) => Standing::Pending(format!("its lambda is {}", phase.as_str())),
-            None => pending("its lambda has not started"),
+            None => pending("it has not confirmed a start yet"),
         }
     }
 
@@ -235,9 +257,10 @@ impl Rollout {
                 json!({ "name": name, "state": state, "reason": reason })
             });
             let vehicles = vehicles.collect::<Vec<_>>();
-            print(&json_line(
-                &json!({ "id": id, "selector": self.selector, "vehicles": vehicles }),
-            ))?;
+            let plan = self.plan.json();
+            print(&json_line(&json!({
+                "id": id, "selector": self.selector, "plan": plan, "vehicles": vehicles,
+            })))?;
         }
         let text = match done == standings.len() {
             true if standings.is_empty() => match self.goal {

@@ -6,6 +6,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use gleaner_base::{Exit, Failure, format_duration, visible};
 use gleaner_fleet::Enrolment;
 use gleaner_fleet::people::{NewVehicle, VehicleState, VehicleSummary};
+use gleaner_trust::{PublicKey, VehicleName};
 use serde_json::json;
 
 use super::{client, list, show};
@@ -21,6 +22,19 @@ pub(super) fn vehicles(args: &VehiclesArgs) -> Result<Exit, Failure> {
             show(args.json, &vehicles, |vehicles| text(vehicles, now, Paint::of_stdout()))
         }
         Some(VehiclesCommand::Enrol(vehicle)) => enrol(vehicle, args.json),
+        Some(VehiclesCommand::Keys) => {
+            let vehicles: Vec<VehicleSummary> = list::all(&client()?, "/v1/vehicles", &[])?;
+            show(args.json, &keys(&vehicles), |keys| {
+                let line = |(name, key): &(VehicleName, PublicKey)| format!("{name} {key}\n");
+                keys.iter().map(line).collect()
+            })
+        }
+        Some(VehiclesCommand::Agree { name }) => {
+            client()?.post_nothing(&format!("/v1/vehicles/{name}/agree"))?;
+            show(args.json, &json!({ "name": name, "agreed": true }), |_| {
+                format!("{name} follows the state of this cloud now\n")
+            })
+        }
         Some(VehiclesCommand::Revoke { name }) => {
             client()?.delete(&format!("/v1/vehicles/{name}"))?;
             show(args.json, &json!({ "name": name, "revoked": true }), |_| {
@@ -58,6 +72,12 @@ fn enrol(args: &NewVehicleArgs, json: bool) -> Result<Exit, Failure> {
     })
 }
 
+/// Returns the keys of vehicles that have connected.
+fn keys(vehicles: &[VehicleSummary]) -> Vec<(VehicleName, PublicKey)> {
+    let key = |it: &VehicleSummary| Some((it.name.parse().ok()?, it.key.parse().ok()?));
+    vehicles.iter().filter_map(key).collect()
+}
+
 pub(super) fn state(state: VehicleState) -> &'static str {
     match state {
         VehicleState::Invited => "invited",
@@ -88,8 +108,22 @@ fn text(vehicles: &[VehicleSummary], now: u64, paint: Paint) -> String {
     let rows = std::iter::once(head.map(str::to_owned)).chain(rows);
     let mut text = table(rows.collect(), &[4, 5, 6]);
     for vehicle in vehicles {
+        if vehicle.is_double {
+            let line = format!(
+                "{}: two machines have its identity, and one is not let in: `gleaner unenrol \
+                 --new-identity` on the copy, and enrol both again",
+                visible(&vehicle.name)
+            );
+            text += &format!("{}\n", paint.yellow(&line));
+        }
         for problem in &vehicle.problems {
-            let line = format!("{}: {}", visible(&vehicle.name), visible(problem));
+            let (name, id) = (visible(&vehicle.name), visible(&problem.deployment));
+            let subject = if id.is_empty() { name } else { format!("{name}: {id}") };
+            let help = match problem.help.is_empty() {
+                true => String::new(),
+                false => format!(". {}", visible(&problem.help)),
+            };
+            let line = format!("{subject}: {}{help}", problem.in_words());
             text += &format!("{}\n", paint.yellow(&line));
         }
     }
@@ -105,7 +139,13 @@ pub(super) fn seen_before(now: u64, seen: u64) -> String {
 
 #[cfg(test)]
 mod tests {
+    use gleaner_fleet::WantedProblem;
+
     use super::*;
+
+    fn problem(title: &str) -> WantedProblem {
+        WantedProblem { title: title.to_owned(), ..WantedProblem::default() }
+    }
 
     #[test]
     fn the_list_has_each_vehicle_with_its_problems() {
@@ -115,9 +155,12 @@ mod tests {
             state: VehicleState::Online,
             seen,
             version: None,
+            key: String::new(),
             wanted: 7,
             handled: 6,
-            problems: problems.iter().map(|text| (*text).to_owned()).collect(),
+            is_ahead: false,
+            is_double: false,
+            problems: problems.iter().map(|text| problem(text)).collect(),
             running: 1,
             deployments: 2,
         };

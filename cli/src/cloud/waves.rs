@@ -19,10 +19,15 @@ const POLL_INTERVAL: Duration = Duration::from_secs(1);
 /// Describes the progress of waves.
 pub(super) fn in_words(waves: &WaveProgress) -> String {
     let WaveProgress { wave, waves: all, state, reason, vehicles, running, failed, .. } = waves;
+    let reason = match reason.split(' ').next() {
+        // Who or what it was.
+        Some("by" | "as") => format!(" {}", visible(reason)),
+        _ => format!(": {}", visible(reason)),
+    };
     let state = match state {
         WaveState::Running => String::new(),
-        WaveState::Paused => format!(", paused: {}", visible(reason)),
-        WaveState::Aborted => format!(", aborted: {}", visible(reason)),
+        WaveState::Paused => format!(" paused{reason}"),
+        WaveState::Aborted => format!(" aborted{reason}"),
     };
     let vehicles = counted(*vehicles, "vehicle");
     format!("wave {wave} of {all}{state}; it runs on {running} of {vehicles}, and {failed} failed")
@@ -37,14 +42,14 @@ pub(super) fn in_words(waves: &WaveProgress) -> String {
 pub(super) fn wait(
     client: &VehicleClient,
     id: &str,
-    release: u64,
+    envelope: &str,
     args: &DeployArgs,
 ) -> Result<bool, Failure> {
     let mut shown = String::new();
     loop {
         let found = deployments(client)?.into_iter().find(|it| it.id == id);
-        let Some(deployment) = found.filter(|it| it.release == release) else {
-            let message = format!("release {release} of `{id}` was replaced or removed meanwhile");
+        let Some(deployment) = found.filter(|it| it.envelope == envelope) else {
+            let message = format!("this deployment of `{id}` was replaced or removed meanwhile");
             return Err(Failure::new(Exit::Differs, message).with_help("`gleaner fleet` lists all"));
         };
         let Some(waves) = &deployment.waves else { return Ok(true) };

@@ -154,6 +154,28 @@ impl VehicleClient {
         }
     }
 
+    /// Sends a request that has no content and no answer.
+    pub(crate) fn post_nothing(&self, path: &str) -> Result<(), Failure> {
+        self.runtime.block_on(async {
+            let body = Either::Left(Full::default());
+            self.request(Method::POST, path, body).await.map(drop)
+        })
+    }
+
+    /// Sends a change without content, of the state with this version if there is one.
+    pub(crate) fn change(
+        &self,
+        method: Method,
+        path: &str,
+        version: &Option<String>,
+    ) -> Result<(), Failure> {
+        let state = version.iter().map(|it| ("if-match", format!("\"{it}\""))).collect::<Vec<_>>();
+        self.runtime.block_on(async {
+            let body = Either::Left(Full::default());
+            self.request_with(method, path, body, &state).await.map(drop)
+        })
+    }
+
     /// Sends a request to remove something.
     pub(crate) fn delete(&self, path: &str) -> Result<(), Failure> {
         self.runtime.block_on(async {

@@ -6,22 +6,22 @@ use std::str::FromStr;
 use std::thread;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-use gleaner_base::{Exit, Failure, PlainFile, format_duration};
-use gleaner_fleet::people::FleetDeployRequest;
+use gleaner_base::{Exit, Failure, PlainFile, format_duration, visible};
+use gleaner_fleet::people::{FleetDeployRequest, ReportedRelease};
 use gleaner_lambda::layout::FILE_MAX;
-use gleaner_lambda::manifest::{ConfigSet, ConfigValue, ItemName, Sha256, TopicName};
+use gleaner_lambda::manifest::{ConfigSet, ConfigValue, ItemName, LambdaName, Sha256};
 use gleaner_lambda::{BuildDir, Manifest};
 use gleaner_protocol::supervision::{LambdaPhase, LambdaStatus};
-use gleaner_protocol::vehicle_api::{
-    Changed, DeployReply, DeploymentStatus, GrantStatus, MissingObject,
-};
+use gleaner_protocol::vehicle_api::{Changed, DeployReply, DeploymentStatus, MissingObject};
 use gleaner_report::format::counted;
 use gleaner_trust::{
-    Deployment, Grants, Payload, Revision, SecretKey, check_files, seal, unverified_revision,
+    Deployment, Grants, Payload, Revision, SecretKey, check_files, seal, sha256,
+    unverified_revision,
 };
 use serde_json::json;
 
 use super::client::VehicleClient;
+use super::former::{Fallback, Former, changes};
 use crate::args::{ChangeArgs, DeployArgs, VehicleArgs};
 use crate::render::json_line;
 use crate::stdout::print;
@@ -36,16 +36,17 @@ const ROUNDS: u32 = 5;
 pub(crate) struct LocalRevision {
     envelope: String,
     revision: Revision,
-    digest: Sha256,
+    pub(crate) digest: Sha256,
     build: BuildDir,
     manifest: Manifest,
 }
 
-/// The deployment that another one replaces.
-pub(crate) struct Former<'a> {
-    /// Digest of the revision that runs.
-    pub(crate) runs: Option<&'a str>,
-    pub(crate) grants: &'a GrantStatus,
+/// A deployment that was accepted.
+pub(crate) struct SentDeployment {
+    /// Number of its attempt on a vehicle.
+    attempt: u64,
+    /// SHA-256 of its envelope.
+    pub(crate) envelope: String,
 }
 
 pub(crate) fn deploy(args: &DeployArgs) -> Result<Exit, Failure> {
@@ -54,14 +55,20 @@ pub(crate) fn deploy(args: &DeployArgs) -> Result<Exit, Failure> {
     let client = VehicleClient::new(&args.vehicle)?;
     let status = client.status()?;
     let id = local.id(args);
-    let removed = status.removed.get(&id).copied();
-    let before = status.deployments.into_iter().find(|deployment| deployment.id == id);
-    let newest = before.as_ref().map(|before| before.release).or(removed);
-    let before = before.as_ref();
-    let former = before.map(|before| Former { runs: runs(before), grants: &before.grants });
-    let deployment = deployment(args, &local, &id, former, newest.unwrap_or(0))?;
-    let attempt = local.deploy(&client, args, &deployment, &key)?;
-    wait(&client, &args.vehicle, &id, attempt, args.timeout)
+    let before = status.deployments.iter().find(|deployment| deployment.id == id);
+    let of = (&*id, local.lambda());
+    let former = before.map(|_| Former::fetch(&client, args, &key, of)).transpose()?.flatten();
+    let release = before.map(|before| before.release).or(status.removed.get(&id).copied());
+    let reported = ReportedRelease { vehicle: status.vehicle, release: release.unwrap_or(0) };
+    let (named, has_failed) = (named_fallback(args)?, before.is_some_and(|it| it.runs_fallback));
+    let former = former.as_ref();
+    let fallback = Fallback::choose(args, named.as_ref(), (former, has_failed), &local.digest);
+    let deployment = deployment(args, &local, &id, (former, fallback), Some(&reported))?;
+    if !args.vehicle.json {
+        print_lines(&changes(&deployment, former, fallback))?;
+    }
+    let sent = local.deploy(&client, args, &deployment, &key)?;
+    wait(&client, &args.vehicle, &id, sent.attempt, args.timeout)
 }
 
 /// Runs `gleaner rollback`, `gleaner start` and `gleaner stop`.
@@ -112,21 +119,27 @@ impl LocalRevision {
         Ok(Self { envelope, revision, digest, build, manifest })
     }
 
+    /// Returns the name of the lambda.
+    pub(crate) fn lambda(&self) -> &LambdaName {
+        &self.revision.name
+    }
+
     /// Returns the id of its deployment.
     pub(crate) fn id(&self, args: &DeployArgs) -> String {
         args.id.clone().unwrap_or_else(|| self.revision.name.to_string())
     }
 
-    /// Signs a deployment and sends it with all missing files; returns its attempt.
+    /// Signs a deployment and sends it with all missing files.
     pub(crate) fn deploy(
         &self,
         client: &VehicleClient,
         args: &DeployArgs,
         deployment: &Deployment,
         key: &SecretKey,
-    ) -> Result<u64, Failure> {
+    ) -> Result<SentDeployment, Failure> {
         let sealed = seal(deployment, &[key])
             .map_err(|refusal| Failure::because("cannot sign the deployment", &refusal))?;
+        let envelope = sha256(&sealed).to_string();
         // Without waves, it is the request that a vehicle takes.
         let request = FleetDeployRequest {
             deployment: String::from_utf8(sealed).expect("an envelope is JSON"),
@@ -168,7 +181,7 @@ impl LocalRevision {
                 deployment.id
             ))?;
         }
-        Ok(attempt)
+        Ok(SentDeployment { attempt, envelope })
     }
 
     fn send(&self, client: &VehicleClient, object: &MissingObject) -> Result<(), Failure> {
@@ -187,59 +200,67 @@ impl LocalRevision {
     }
 }
 
-/// Returns the deployment of a revision, after the release `newest`.
+/// Returns the deployment of a revision, which follows the former one. Everything in it is of the
+/// options, of manifests, or of what deployers signed.
+///
+/// # Errors
+///
+/// A failure if an option is not valid, or `reported` is a release as high as this one: a vehicle
+/// accepts only a higher one, and who signs decides which.
 pub(crate) fn deployment(
     args: &DeployArgs,
     local: &LocalRevision,
     id: &str,
-    former: Option<Former<'_>>,
-    newest: u64,
+    (former, fallback): (Option<&Former>, Option<Fallback<'_>>),
+    reported: Option<&ReportedRelease>,
 ) -> Result<Deployment, Failure> {
-    let fallback = match args.fallback.as_deref() {
-        Some("none") => None,
-        Some(digest) => Some(parse::<Sha256>("--fallback", digest)?),
-        None => former.as_ref().and_then(|former| former.runs?.parse().ok()),
-    };
     let created = now();
-    let release = args.release.unwrap_or(newest + 1);
+    let newest = former.map_or(0, |former| former.deployment.release);
+    // One that is too high is refused by its format.
+    let release = args.release.unwrap_or(newest.saturating_add(1));
+    let higher = reported.filter(|it| args.release.is_none() && it.release >= release);
+    if let Some(ReportedRelease { vehicle, release: reported }) = higher {
+        let message = format!("this would be release {release} of `{id}`");
+        let mut failure = Failure::new(Exit::Denied, message);
+        let vehicle = visible(vehicle);
+        failure.causes =
+            vec![format!("{vehicle} reports release {reported}, and refuses lower ones")];
+        return Err(failure.with_help("choose the number yourself: `--release N`"));
+    }
     let label = |text: &String| {
         let (name, value) = text.split_once('=').unwrap_or((text, ""));
         Ok((parse("--label", name)?, value.to_owned()))
     };
+    let manifests = std::iter::once(&local.manifest).chain(fallback.and_then(|it| it.manifest()));
     Ok(Deployment {
         id: parse("--id", id)?,
         release,
         selector: args.label.iter().map(label).collect::<Result<_, Failure>>()?,
         revision: local.digest.clone(),
-        fallback: fallback.filter(|fallback| *fallback != local.digest),
+        fallback: fallback.map(|fallback| fallback.digest.clone()),
         config: config(&local.manifest, &args.set)?,
-        grants: grants(&local.manifest, former.map(|former| former.grants)),
+        grants: grants(manifests),
         created,
         expires: created.saturating_add(args.expires.as_secs()),
     })
 }
 
-/// Returns the digest of the revision that runs.
-fn runs(deployment: &DeploymentStatus) -> Option<&str> {
-    let fallback = deployment.fallback.as_ref().filter(|_| deployment.runs_fallback);
-    let revision = fallback.unwrap_or(&deployment.revision);
-    Some(revision.digest.as_str()).filter(|digest| !digest.is_empty())
+/// Returns the digest that `--fallback` names.
+pub(crate) fn named_fallback(args: &DeployArgs) -> Result<Option<Sha256>, Failure> {
+    let named = args.fallback.as_deref().filter(|named| *named != "none");
+    named.map(|digest| parse::<Sha256>("--fallback", digest)).transpose()
 }
 
-/// Returns what the manifest asks for, and what its fallback had.
-fn grants(manifest: &Manifest, granted: Option<&GrantStatus>) -> Grants {
-    let inputs = manifest.inputs.iter().map(|input| &input.topic);
-    let recorded = manifest.record.iter().flat_map(|record| &record.topics);
-    let topics = granted.into_iter().flat_map(|granted| &granted.topics);
-    let topics = topics.filter_map(|topic| topic.parse::<TopicName>().ok());
-    let models = granted.into_iter().flat_map(|granted| &granted.models);
-    let models = models.filter_map(|model| model.parse::<ItemName>().ok());
-    let own = manifest.models.iter().map(|model| model.name.clone());
-    let mut grants = Grants {
-        topics: inputs.chain(recorded).cloned().chain(topics).collect(),
-        models: own.chain(models).collect(),
-        record: manifest.record.is_some() || granted.is_some_and(|granted| granted.record),
-    };
+/// Returns the rights that the manifests of a revision and of its fallback ask for.
+fn grants<'m>(manifests: impl Iterator<Item = &'m Manifest>) -> Grants {
+    let mut grants = Grants::default();
+    for manifest in manifests {
+        let inputs = manifest.inputs.iter().map(|input| &input.topic);
+        let recorded = manifest.record.iter().flat_map(|record| &record.topics);
+        grants.topics.extend(inputs.chain(recorded).cloned());
+        grants.models.extend(manifest.models.iter().map(|model| model.name.clone()));
+        grants.record |= manifest.record.is_some();
+    }
     grants.topics.sort();
     grants.topics.dedup();
     grants.models.sort();
@@ -257,6 +278,11 @@ fn config(manifest: &Manifest, set: &[String]) -> Result<BTreeMap<ItemName, Conf
     let is_set = |name: &String| pairs.iter().any(|(key, _)| key == name);
     let set = values.into_iter().filter(|(name, _)| is_set(name));
     set.map(|(name, value)| Ok((parse("--set", &name)?, value))).collect()
+}
+
+/// Prints lines of what is about to be signed or changed.
+pub(crate) fn print_lines(lines: &[String]) -> Result<(), Failure> {
+    print(&lines.iter().map(|line| format!("{line}\n")).collect::<String>())
 }
 
 fn parse<T: FromStr>(option: &str, text: &str) -> Result<T, Failure> {

@@ -1,5 +1,8 @@
 //! `gleaner status`: what runs on a vehicle.
 
+use std::thread;
+use std::time::{Duration, Instant};
+
 use gleaner_base::{Exit, Failure, UtcTime, format_duration, in_one_line, visible};
 use gleaner_protocol::LossOutcome;
 use gleaner_protocol::link::RecorderStatus;
@@ -12,12 +15,26 @@ use crate::args::StatusArgs;
 use crate::render::{Paint, json_line, table};
 use crate::stdout::print;
 
+/// Age of a status from which a newer one is waited for, in s, and the longest wait.
+const FRESH_S: f64 = 2.0;
+const FRESH_WAIT: Duration = Duration::from_secs(2);
+
 /// Shown without deployments.
 pub(super) const NO_DEPLOYMENTS: &str =
     "nothing is deployed: `gleaner deploy --local DIR --key FILE`";
 
 pub(crate) fn status(args: &StatusArgs) -> Result<Exit, Failure> {
-    let status = VehicleClient::of(&args.vehicle, &args.on)?.status()?;
+    let client = VehicleClient::of(&args.vehicle, &args.on)?;
+    let mut status = client.status()?;
+    // The first request lets a connected vehicle report at once.
+    let (started, first) = (Instant::now(), status.age_s);
+    while first.is_some_and(|age_s| age_s > FRESH_S) && started.elapsed() < FRESH_WAIT {
+        thread::sleep(FRESH_WAIT / 10);
+        status = client.status()?;
+        if status.age_s < first {
+            break;
+        }
+    }
     print(&match args.vehicle.json {
         true => json_line(&status),
         false => text(&status, Paint::of_stdout()),
@@ -26,9 +43,13 @@ pub(crate) fn status(args: &StatusArgs) -> Result<Exit, Failure> {
 }
 
 pub(super) fn text(status: &VehicleStatus, paint: Paint) -> String {
-    let labels = status.labels.iter().map(|(name, value)| format!("{name}={}", visible(value)));
+    let labels = status.labels.iter();
+    let labels = labels.map(|(name, value)| format!("{}={}", visible(name), visible(value)));
     let labels = labels.collect::<Vec<_>>().join(" ");
     let mut text = format!("{} {}\n", paint.bold(&visible(&status.vehicle)), paint.dim(&labels));
+    if let Some(age) = age(status) {
+        text += &format!("  as of {age}\n");
+    }
     text += &format!("  clips are signed by {}\n", visible(&status.key));
     text += &match &status.trust {
         None => format!("  {}\n", paint.yellow("no trust root: `gleaner trust install FILE`")),
@@ -70,12 +91,19 @@ pub(super) fn text(status: &VehicleStatus, paint: Paint) -> String {
     text += "\n";
     text += &table(rows.collect(), &[5, 6, 7, 8, 9, 10]);
     for deployment in &status.deployments {
+        text += &format!("{}\n", paint.dim(&content(deployment)));
         for reason in reasons(deployment) {
-            let line = format!("{}: {reason}", deployment.id);
+            let line = format!("{}: {reason}", visible(&deployment.id));
             text += &format!("{}\n", paint.yellow(&line));
         }
     }
     text
+}
+
+/// Formats the age of a status that a cloud has.
+pub(super) fn age(status: &VehicleStatus) -> Option<String> {
+    let age = Duration::try_from_secs_f64(status.age_s?.round()).ok()?;
+    Some(format!("{} ago", format_duration(age)))
 }
 
 /// Returns the line of the connection to a cloud, if there is one.
@@ -87,7 +115,7 @@ pub(crate) fn cloud_line(status: Option<&CloudStatus>, paint: Paint) -> String {
         state => paint.yellow(&visible(state)),
     };
     let reason = status.reason.iter().map(|reason| format!(": {}", visible(reason)));
-    let since = std::time::Duration::from_secs(status.since_s.max(0.0) as u64);
+    let since = Duration::from_secs(status.since_s.max(0.0) as u64);
     format!(
         "  cloud {} {state} for {}{}; {} not sent, certificate until {}\n",
         visible(&status.address),
@@ -130,6 +158,22 @@ pub(super) fn version(deployment: &DeploymentStatus) -> String {
     format!("{}{mark}", visible(&fallback.unwrap_or(&deployment.revision).version))
 }
 
+/// Returns what was signed, and runs: deployments of one number differ by their digests.
+fn content(deployment: &DeploymentStatus) -> String {
+    let DeploymentStatus { id, release, envelope, revision, fallback, config, .. } = deployment;
+    let short = |digest: &str| visible(&digest.chars().take(12).collect::<String>());
+    let runs = fallback.as_ref().filter(|_| deployment.runs_fallback).unwrap_or(revision);
+    let set = config.iter().map(|(name, value)| format!(" {}={}", visible(name), visible(value)));
+    format!(
+        "{}: release {release} ({}), revision {} ({}){}",
+        visible(id),
+        short(envelope),
+        runs.release,
+        short(&runs.digest),
+        set.collect::<String>()
+    )
+}
+
 /// Returns the reasons why a deployment does not run as wanted, each with its subject.
 pub(super) fn reasons(deployment: &DeploymentStatus) -> Vec<String> {
     let last_end = deployment.status.as_ref().and_then(|lambda| lambda.last_end.as_ref());
@@ -170,13 +214,13 @@ fn service<S>(name: &str, status: Option<&ProcessStatus<S>>, paint: Paint) -> St
 
 fn row(deployment: &DeploymentStatus) -> [String; 11] {
     let lambda = deployment.status.as_ref();
-    let seconds = lambda.map(|lambda| std::time::Duration::from_secs(lambda.phase_s as u64));
+    let seconds = lambda.map(|lambda| Duration::from_secs(lambda.phase_s as u64));
     let live = lambda.and_then(|lambda| lambda.live.as_deref());
     let count = |count: Option<u64>| count.map_or_else(|| "-".to_owned(), grouped);
     let latency = live.and_then(|live| live.wake_latency);
     [
-        deployment.id.clone(),
-        deployment.lambda.clone(),
+        visible(&deployment.id),
+        visible(&deployment.lambda),
         version(deployment),
         state(deployment).to_owned(),
         seconds.map_or_else(|| "-".to_owned(), format_duration),

@@ -61,7 +61,8 @@ impl Workplace {
     fn verified(&self) -> Revision {
         let root = programs::trusting(&self.done(&["keys", "show", "key.pem", "--json"]));
         let (floors, labels) = (Floors::default(), Labels::new());
-        let vehicle = Verifier { root: &root, floors: &floors, labels: &labels, now: 0 };
+        let vehicle =
+            Verifier { root: &root, floors: &floors, labels: &labels, now: 0, known: &[] };
         let envelope = fs::read(self.path("brake/revision.json")).unwrap();
         vehicle.revision(&envelope).unwrap().payload().clone()
     }

@@ -4,6 +4,7 @@ use std::cell::RefCell;
 use std::io::{self, Read};
 
 use prost::Message;
+use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use zstd::bulk::Decompressor;
 
@@ -28,6 +29,9 @@ pub const RECORDS_MAX: usize = 4000;
 
 /// Longest lease of streams that people read, in s; a cloud renews it in time.
 pub const TAIL_S: u32 = 60;
+
+/// Name in a lease of the vehicle's status, which it reports each second then.
+pub const STATUS_STREAM: &str = "status";
 
 /// Maximum number of streams in a lease.
 pub const TAIL_STREAMS_MAX: usize = 64;
@@ -93,6 +97,13 @@ pub struct Hello {
     /// Public key that verifies its clips.
     #[prost(string, tag = "3")]
     pub key: String,
+    /// Number of the newest wanted state of this cloud that it has followed: a cloud with a lower
+    /// one was restored from a backup.
+    #[prost(uint64, tag = "4")]
+    pub followed: u64,
+    /// Boot of its machine, as 32 hexadecimal digits: a machine never comes back to a former one.
+    #[prost(string, tag = "5")]
+    pub boot: String,
 }
 
 /// The answer to [`Hello`].
@@ -147,6 +158,10 @@ pub struct Desired {
     /// All deployments, by id.
     #[prost(message, repeated, tag = "2")]
     pub deployments: Vec<Wanted>,
+    /// True if nothing is to be stopped or removed: the cloud is older than what the vehicle has
+    /// followed, and no person has agreed to its state yet.
+    #[prost(bool, tag = "3")]
+    pub keeps: bool,
 }
 
 /// A wanted deployment.
@@ -181,8 +196,57 @@ pub struct Reported {
     #[prost(bytes = "vec", tag = "2")]
     pub status: Vec<u8>,
     /// The reasons why parts of the wanted state are not applied.
-    #[prost(string, repeated, tag = "3")]
-    pub problems: Vec<String>,
+    #[prost(message, repeated, tag = "4")]
+    pub problems: Vec<WantedProblem>,
+}
+
+/// The reason why a wanted deployment is not applied.
+#[derive(Clone, PartialEq, Eq, Hash, Message, Serialize, Deserialize)]
+#[serde(default)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct WantedProblem {
+    /// Id of the deployment.
+    #[prost(string, tag = "1")]
+    pub deployment: String,
+    /// SHA-256 of its signed envelope.
+    #[prost(string, tag = "2")]
+    pub envelope: String,
+    /// The failed action.
+    #[prost(string, tag = "3")]
+    pub title: String,
+    /// True if the vehicle could not fetch it yet, and goes on by itself; false if it refuses it.
+    #[prost(bool, tag = "4")]
+    pub is_pending: bool,
+    /// The causes, the nearest first.
+    #[prost(string, repeated, tag = "5")]
+    pub causes: Vec<String>,
+    /// Help for the user; empty without any.
+    #[prost(string, tag = "6")]
+    pub help: String,
+}
+
+impl WantedProblem {
+    /// Returns the action and its causes in one line, safe to print.
+    pub fn in_words(&self) -> String {
+        let parts = std::iter::once(&self.title).chain(&self.causes);
+        parts.map(|part| gleaner_base::visible(part)).collect::<Vec<_>>().join(": ")
+    }
+
+    /// Shortens each text to so many characters, and the causes to so many, and escapes what is no
+    /// text to print.
+    pub fn bounded(&self, causes: usize, characters: usize) -> Self {
+        let short = |text: &String| {
+            gleaner_base::visible(&text.chars().take(characters).collect::<String>())
+        };
+        Self {
+            deployment: gleaner_base::excerpt(&self.deployment),
+            envelope: gleaner_base::excerpt(&self.envelope),
+            title: short(&self.title),
+            is_pending: self.is_pending,
+            causes: self.causes.iter().take(causes).map(short).collect(),
+            help: short(&self.help),
+        }
+    }
 }
 
 /// Records of a stream.
@@ -360,7 +424,8 @@ mod tests {
 
     #[test]
     fn a_frame_is_decoded_as_it_was_encoded() {
-        let desired = Desired { generation: 7, deployments: vec![wanted("a"), wanted("b")] };
+        let deployments = vec![wanted("a"), wanted("b")];
+        let desired = Desired { generation: 7, deployments, keeps: true };
         let bytes = Frame::encoded(Body::Desired(desired.clone()));
         assert_eq!(Frame::decoded(&bytes).unwrap().body, Some(Body::Desired(desired)));
     }

@@ -24,7 +24,8 @@ pub use enrolment::{
 };
 pub use frame::{
     Ack, Body, Cursor, Desired, FRAME_MAX, Frame, FrameError, GoAway, Hello, LINES_MAX, PROTOCOL,
-    Ping, Pong, RECORDS_MAX, Records, Reported, STREAM_NAME_MAX, TAIL_S, TAIL_STREAMS_MAX, Tail,
-    WANTED_MAX, Wanted, Welcome, compress, decompress, desired_digest,
+    Ping, Pong, RECORDS_MAX, Records, Reported, STATUS_STREAM, STREAM_NAME_MAX, TAIL_S,
+    TAIL_STREAMS_MAX, Tail, WANTED_MAX, Wanted, WantedProblem, Welcome, compress, decompress,
+    desired_digest,
 };
 pub use object::{AnnouncedFile, UnfinishedFile};

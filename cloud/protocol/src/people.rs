@@ -12,6 +12,7 @@ use std::str::FromStr;
 use gleaner_protocol::vehicle_api::GrantStatus;
 use serde::{Deserialize, Serialize};
 
+use crate::WantedProblem;
 use crate::waves::{WavePlan, WaveProgress};
 
 /// A part of a list that can grow: `?after=CURSOR&limit=N`.
@@ -188,12 +189,22 @@ pub struct VehicleSummary {
     pub seen: Option<u64>,
     /// Version of its orchestrator.
     pub version: Option<String>,
+    /// Public key that verifies its clips, as it states it; empty before its first connection.
+    #[serde(default)]
+    pub key: String,
     /// Number of its wanted state.
     pub wanted: u64,
     /// Number of the newest wanted state that it has handled.
     pub handled: u64,
+    /// True if it has followed a newer state than that of this cloud, which was restored from a
+    /// backup: it stops and removes nothing until a person agrees.
+    #[serde(default)]
+    pub is_ahead: bool,
+    /// True if two machines have its identity, and one of them is not let in.
+    #[serde(default)]
+    pub is_double: bool,
     /// The reasons why parts of its wanted state are not applied.
-    pub problems: Vec<String>,
+    pub problems: Vec<WantedProblem>,
     /// Number of its deployments that run.
     pub running: u64,
     /// Number of its deployments.
@@ -229,6 +240,17 @@ pub struct FleetDeployRequest {
     pub waves: Option<WavePlan>,
 }
 
+/// The highest release of a deployment that a vehicle has reported, also of one that was removed or
+/// that the cloud does not have. It is unsigned, and so a hint.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct ReportedRelease {
+    /// The vehicle.
+    pub vehicle: String,
+    /// Number of the release.
+    pub release: u64,
+}
+
 /// A deployment of the fleet.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
@@ -240,15 +262,21 @@ pub struct FleetDeployment {
     /// Digest of what people and waves want of it: the part of its `ETag` before the dot.
     #[serde(default)]
     pub version: String,
+    /// SHA-256 of its signed envelope: what a vehicle that runs it reports.
+    #[serde(default)]
+    pub envelope: String,
     /// Digest of its revision.
     pub revision: String,
     /// Digest of its fallback.
     pub fallback: Option<String>,
-    /// Rights of its lambda, which the next deployment grants as well: its fallback needs them.
+    /// Rights of its lambda.
     #[serde(default)]
     pub grants: GrantStatus,
     /// Labels that a vehicle must have.
     pub selector: BTreeMap<String, String>,
+    /// Those of older releases that vehicles still have.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub older_selectors: Vec<BTreeMap<String, String>>,
     /// False if it is stopped.
     pub is_wanted: bool,
     /// Number of vehicles that should run it.

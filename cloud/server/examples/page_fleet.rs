@@ -14,7 +14,7 @@ use std::time::Duration;
 
 use fake::{FakeLink, FakeVehicle, Person};
 use gleaner_cloud::{CloudServer, ServeOptions};
-use gleaner_fleet::{Body, Desired, Ping, Records, Reported, Wanted, compress};
+use gleaner_fleet::{Body, Desired, Ping, Records, Reported, Wanted, WantedProblem, compress};
 use gleaner_protocol::supervision::{LambdaPhase, LambdaStatus, ProcessStatus, SupervisorStatus};
 use gleaner_protocol::vehicle_api::{DeploymentStatus, RevisionStatus, VehicleStatus};
 use gleaner_protocol::{DurationStats, Layer, LiveStatus, LiveTopic};
@@ -200,7 +200,15 @@ async fn report(
     }
     let generation = desired.generation;
     let status = compress(&serde_json::to_vec(&status).unwrap());
-    let problems = if is_hostile { vec![HOSTILE.to_owned()] } else { Vec::new() };
+    let text = || HOSTILE.to_owned();
+    let hostile = WantedProblem {
+        deployment: text(),
+        title: text(),
+        causes: vec![text()],
+        help: text(),
+        ..WantedProblem::default()
+    };
+    let problems = if is_hostile { vec![hostile] } else { Vec::new() };
     link.send(Body::Reported(Reported { generation, status, problems })).await;
 }
 
@@ -221,6 +229,7 @@ async fn deployment(
     Some(DeploymentStatus {
         id: wanted.id.clone(),
         release: signed.release,
+        envelope: wanted.envelope.clone(),
         attempt: 1,
         lambda: wanted.id.clone(),
         revision: RevisionStatus { digest: digest.clone(), version: "1.0.0".into(), release: 1 },

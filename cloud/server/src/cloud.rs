@@ -2,7 +2,8 @@
 
 use std::sync::Arc;
 
-use tokio::sync::Semaphore;
+use tokio::sync::{Mutex, Semaphore};
+use tokio::time::Instant;
 
 use crate::attempts::{AccountChanges, VehicleLimits, WrongSecrets};
 use crate::authority::Authorities;
@@ -35,6 +36,8 @@ pub(crate) struct Cloud {
     /// Frames of vehicles that are parsed and stored at a time.
     pub(crate) stored_frames: Semaphore,
     pub(crate) retention: Retention,
+    /// Time of the last look at the database for `/health`, and its version then.
+    pub(crate) health: Mutex<Option<(Instant, i64)>>,
     /// Days for which records are kept at least; 0 is without an end.
     pub(crate) keep_records_days: u32,
     /// Address for vehicles, as enrolments state it.

@@ -14,7 +14,7 @@
 //! hints that something has.
 //!
 //! Nothing here runs a lambda, or decides what a vehicle runs: each vehicle verifies signatures by
-//! its own trust root.
+//! its own trust root. `counts` has the numbers that `/metrics` shows.
 
 mod accept;
 mod attempts;
@@ -24,6 +24,7 @@ mod bus;
 mod clients;
 mod clips;
 mod cloud;
+mod counts;
 mod error;
 mod folder;
 mod hub;

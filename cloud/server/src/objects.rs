@@ -13,13 +13,14 @@ use axum::http::HeaderMap;
 use axum::response::Response;
 use gleaner_base::{Exit, Failure};
 use gleaner_lambda::manifest::Sha256;
+use gleaner_lambda::manifest::bounds::MANIFEST_MAX;
 use gleaner_protocol::vehicle_api::MissingObject;
 use gleaner_trust::Revision;
 use tokio::sync::RwLock;
 use tokio::time::interval;
 
 use crate::cloud::Cloud;
-use crate::error::CloudResult;
+use crate::error::{CloudError, CloudResult};
 use crate::folder::PART;
 use crate::place::{FilePlace, blocking};
 use crate::store::CloudStore;
@@ -118,6 +119,26 @@ impl Objects {
         Ok(self.place.keep(&part, sha256.as_str()).await.map_err(|error| {
             Failure::caused_by(Exit::Internal, format!("cannot store {name}"), &error)
         })?)
+    }
+
+    /// Returns the text of the manifest of a revision.
+    pub(crate) async fn manifest(&self, revision: &Revision) -> CloudResult<String> {
+        let mut files = revision.files.iter();
+        let file = files.find(|file| file.path.as_str() == "lambda.toml");
+        let Some(file) = file.filter(|file| file.bytes <= MANIFEST_MAX.bytes()) else {
+            let message = format!("a revision of `{}` has no manifest that fits", revision.name);
+            return Err(CloudError::usage(message, "build and publish the lambda again"));
+        };
+        let failed = |error: io::Error| {
+            let action = format!("cannot read the manifest {}", file.sha256);
+            Failure::caused_by(Exit::Internal, action, &error)
+        };
+        let content = self.place.content(file.sha256.as_str(), 0).await.map_err(failed)?;
+        let content = content.ok_or_else(|| failed(io::ErrorKind::NotFound.into()))?;
+        let most = usize::try_from(file.bytes).unwrap_or(usize::MAX);
+        let bytes = axum::body::to_bytes(content, most).await;
+        let bytes = bytes.map_err(|error| failed(io::Error::other(error)))?;
+        Ok(String::from_utf8_lossy(&bytes).into_owned())
     }
 
     /// Returns the answer with a file, or with the end of it.

@@ -7,8 +7,9 @@
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
+use gleaner_fleet::STATUS_STREAM;
 use gleaner_lambda::manifest::ItemName;
 use tokio::sync::Notify;
 use tokio::time::{MissedTickBehavior, interval, sleep};
@@ -23,10 +24,17 @@ const RETRY: Duration = Duration::from_secs(2);
 /// Least time between two times at which leases are stored.
 const PAUSE: Duration = Duration::from_millis(200);
 
+/// Time after a request for the status of a vehicle in which others are likely to follow.
+const WATCHED: Duration = Duration::from_secs(10);
+/// Number of vehicles whose statuses are leased at a time: each of them reports each second.
+const WATCHED_MAX: usize = 64;
+
 /// The streams that this process reads, and the number of readers of each.
 #[derive(Debug, Default)]
 pub(crate) struct Tails {
     read: Mutex<BTreeMap<(String, String), usize>>,
+    /// Vehicles whose statuses are read, until these times.
+    watched: Mutex<BTreeMap<String, Instant>>,
     is_new: Notify,
 }
 
@@ -56,6 +64,22 @@ impl Tails {
         TailReader { tails: Arc::clone(self), keys }
     }
 
+    /// Begins or extends a lease of the status of a vehicle, for a reader that asks repeatedly.
+    pub(crate) fn watch(&self, vehicle: &str) {
+        let mut watched = self.watched.lock().unwrap_or_else(PoisonError::into_inner);
+        let now = Instant::now();
+        watched.retain(|_, until| *until > now);
+        let is_new = !watched.contains_key(vehicle);
+        if is_new && (watched.len() >= WATCHED_MAX || vehicle.chars().any(char::is_control)) {
+            return;
+        }
+        watched.insert(vehicle.to_owned(), now + WATCHED);
+        drop(watched);
+        if is_new {
+            self.is_new.notify_one();
+        }
+    }
+
     /// Lets a vehicle that has connected learn of its readers here.
     pub(crate) fn connected(&self, vehicle: &str) {
         let first = (vehicle.to_owned(), String::new());
@@ -66,7 +90,12 @@ impl Tails {
     }
 
     fn all(&self) -> Vec<(String, String)> {
-        self.lock().keys().cloned().collect()
+        let now = Instant::now();
+        let mut watched = self.watched.lock().unwrap_or_else(PoisonError::into_inner);
+        watched.retain(|_, until| *until > now);
+        let watched = watched.keys().map(|vehicle| (vehicle.clone(), STATUS_STREAM.to_owned()));
+        let watched: Vec<_> = watched.collect();
+        self.lock().keys().cloned().chain(watched).collect()
     }
 
     fn lock(&self) -> MutexGuard<'_, BTreeMap<(String, String), usize>> {
@@ -128,8 +157,6 @@ pub(crate) async fn deliver(cloud: &Cloud) -> CloudResult<()> {
 
 #[cfg(test)]
 mod tests {
-    use std::time::Instant;
-
     use tokio::sync::mpsc;
 
     use super::*;
@@ -161,6 +188,19 @@ mod tests {
             () = readers => {}
         }
         assert!(begun.elapsed() >= 3 * PAUSE, "{:?}", begun.elapsed());
+    }
+
+    #[test]
+    fn statuses_of_some_vehicles_are_leased_and_no_name_that_cannot_be_stored() {
+        let tails = Tails::default();
+        tails.watch("car\0");
+        for number in 0..2 * WATCHED_MAX {
+            tails.watch(&format!("car-{number}"));
+            tails.watch("car-0");
+        }
+        let all = tails.all();
+        assert_eq!(all.len(), WATCHED_MAX);
+        assert!(all.contains(&("car-0".to_owned(), "status".to_owned())));
     }
 
     #[test]

@@ -2,7 +2,7 @@
 
 use gleaner_fleet::{
     Ack, Body, Cursor, Desired, Enrolment, Frame, GoAway, Hello, PROTOCOL, Ping, Pong, Records,
-    Reported, Tail, Wanted, Welcome, compress,
+    Reported, Tail, Wanted, WantedProblem, Welcome, compress,
 };
 
 use crate::fleet::mode;
@@ -61,13 +61,26 @@ pub fn all() -> Vec<Vec<u8>> {
             protocol: PROTOCOL,
             version: "0.1.0".to_owned(),
             key: "key".to_owned(),
+            followed: 7,
+            boot: "0".repeat(32),
         }),
         Body::Welcome(Welcome { epoch: 5, time_ms: -1, ping_s: 20, cursors: vec![cursor] }),
-        Body::Desired(Desired { generation: 7, deployments: vec![wanted("a", 0), wanted("b", 1)] }),
+        Body::Desired(Desired {
+            generation: 7,
+            deployments: vec![wanted("a", 0), wanted("b", 1)],
+            keeps: true,
+        }),
         Body::Reported(Reported {
             generation: 7,
             status: compress(b"{}"),
-            problems: vec!["a: refused".to_owned()],
+            problems: vec![WantedProblem {
+                deployment: "a".to_owned(),
+                envelope: "0".repeat(64),
+                title: "refused".to_owned(),
+                is_pending: true,
+                causes: vec!["a cause".to_owned()],
+                help: "a help".to_owned(),
+            }],
         }),
         Body::Records(records),
         Body::Ack(Ack { stream: "events".to_owned(), life: 2, next: 9 }),

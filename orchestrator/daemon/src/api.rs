@@ -5,10 +5,12 @@
 //! | `GET /v1/status` | [`VehicleStatus`] |
 //! | `POST /v1/deployments` | [`DeployReply`], of a [`DeployRequest`] |
 //! | `PUT /v1/objects/SHA256` | nothing, of a file that a deployment needs |
+//! | `GET /v1/deployments/ID/envelopes` | [`DeploymentEnvelopes`] |
 //! | `DELETE /v1/deployments/ID` | nothing, once it is removed |
 //! | `POST /v1/deployments/ID/start`, `stop`, `rollback` | [`Changed`] |
 //! | `PUT /v1/trust` | nothing, of a trust root's envelope |
-//! | `PUT /v1/cloud`, `DELETE` | nothing, of an enrolment; nothing, once it is ended |
+//! | `PUT /v1/cloud` | nothing, of an enrolment |
+//! | `DELETE /v1/cloud` | nothing, once it is ended; with `?new_identity=true`, also the key |
 //! | `GET /v1/events`, `GET /v1/lambdas/ID/records` | a [`StreamLine`] per line |
 //! | `GET /metrics` | counts for Prometheus |
 //!
@@ -26,7 +28,7 @@ use axum::routing::{delete, get, post, put};
 use gleaner_base::{Exit, Failure};
 use gleaner_lambda::manifest::{ItemName, Sha256};
 use gleaner_protocol::vehicle_api::{
-    Changed, DeployReply, DeployRequest, Problem, ProgramStatus, VehicleStatus,
+    Changed, DeployReply, DeployRequest, DeploymentEnvelopes, Problem, ProgramStatus, VehicleStatus,
 };
 use gleaner_trust::{PublicKey, VehicleName};
 use gleaner_vitals::usage;
@@ -70,6 +72,15 @@ pub(crate) struct StreamQuery {
     pub(crate) follow: bool,
 }
 
+/// Choice of what ends with an enrolment.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct LeaveQuery {
+    /// True if the key of the vehicle, which signs its clips, is removed, too.
+    #[serde(default)]
+    new_identity: bool,
+}
+
 type Reply<T> = Result<T, ApiError>;
 
 impl Api {
@@ -80,6 +91,7 @@ impl Api {
             .route("/v1/deployments", post(deploy))
             .route("/v1/objects/{sha256}", put(object))
             .route("/v1/deployments/{id}", delete(remove))
+            .route("/v1/deployments/{id}/envelopes", get(envelopes))
             .route("/v1/deployments/{id}/{change}", post(change))
             .route("/v1/trust", put(trust))
             .route("/v1/cloud", put(enrol).delete(leave))
@@ -118,6 +130,7 @@ impl Api {
             events_lost: self.core.events.lost(),
             supervisor,
             cloud: self.cloud.status(),
+            age_s: None,
         }
     }
 
@@ -146,6 +159,13 @@ async fn deploy(State(api): State<Api>, body: Bytes) -> Reply<axum::Json<DeployR
     let request: DeployRequest = serde_json::from_slice(&body)
         .map_err(|error| Failure::caused_by(Exit::Usage, "the request is no deployment", &error))?;
     Ok(axum::Json(api.blocking(move |core| core.deploy(&request, None)).await?))
+}
+
+async fn envelopes(
+    State(api): State<Api>,
+    Path(id): Path<String>,
+) -> Reply<axum::Json<DeploymentEnvelopes>> {
+    Ok(axum::Json(api.blocking(move |core| core.envelopes(&id)).await?))
 }
 
 /// Receives a file. It counts only if its digest is right.
@@ -193,9 +213,20 @@ async fn enrol(State(api): State<Api>, body: Bytes) -> Reply<StatusCode> {
     Ok(StatusCode::NO_CONTENT)
 }
 
-async fn leave(State(api): State<Api>) -> Reply<StatusCode> {
-    api.cloud.leave()?;
-    Ok(StatusCode::NO_CONTENT)
+async fn leave(State(api): State<Api>, Query(query): Query<LeaveQuery>) -> Reply<StatusCode> {
+    if api.cloud.status().is_some() || !query.new_identity {
+        api.cloud.leave()?;
+    }
+    if !query.new_identity {
+        return Ok(StatusCode::NO_CONTENT);
+    }
+    // The next start makes another one.
+    match std::fs::remove_file(api.layout.key()) {
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+            Err(Failure::caused_by(Exit::Internal, "cannot remove the key", &error).into())
+        }
+        _ => Ok(StatusCode::NO_CONTENT),
+    }
 }
 
 async fn events(State(api): State<Api>, Query(query): Query<StreamQuery>) -> Reply<Response> {

@@ -6,7 +6,7 @@ use gleaner_lambda::manifest::{ConfigSet, ItemName, Sha256};
 use gleaner_lambda::{BuildDir, Manifest};
 use gleaner_protocol::supervision::DesiredLambda;
 use gleaner_protocol::vehicle_api::{DeploymentStatus, GrantStatus, RevisionStatus};
-use gleaner_trust::{Deployment, Refusal, Revision, Trusted, Verifier};
+use gleaner_trust::{Deployment, Refusal, Revision, Trusted, Verifier, sha256};
 
 use crate::state::Deployed;
 use crate::store::RevisionStore;
@@ -14,6 +14,8 @@ use crate::store::RevisionStore;
 /// A deployment with its revisions, as their keys signed them.
 pub(crate) struct SignedDeployment {
     pub(crate) deployment: Trusted<Deployment>,
+    /// SHA-256 of its envelope.
+    envelope: Sha256,
     pub(crate) revision: Trusted<Revision>,
     pub(crate) fallback: Option<Trusted<Revision>>,
     /// Overrides of the config that its fallback knows.
@@ -47,7 +49,8 @@ impl SignedDeployment {
         let fallback = wish.fallback.as_ref().map(|it| revision("fallback", it)).transpose()?;
         let revision = revision("revision", &wish.revision)?;
         verifier.admit(&deployment, &revision, fallback.as_ref()).map_err(refused)?;
-        Ok(Self { deployment, revision, fallback, fallback_set: Vec::new() })
+        let envelope = sha256(envelope);
+        Ok(Self { deployment, envelope, revision, fallback, fallback_set: Vec::new() })
     }
 
     pub(crate) fn id(&self) -> &ItemName {
@@ -117,10 +120,12 @@ impl SignedDeployment {
     /// Returns its status, without that of its lambda.
     /// `stale` is the reason if its end is over.
     pub(crate) fn status(&self, deployed: &Deployed, stale: Option<Refusal>) -> DeploymentStatus {
-        let grants = &self.deployment.payload().grants;
+        let Deployment { grants, release, .. } = self.deployment.payload();
         DeploymentStatus {
             id: self.id().to_string(),
-            release: self.deployment.payload().release,
+            release: *release,
+            envelope: self.envelope.to_string(),
+            config: overrides(self.deployment.payload()).into_iter().collect(),
             attempt: deployed.attempt,
             lambda: self.revision.payload().name.to_string(),
             revision: revision_status(&self.revision),

@@ -8,7 +8,7 @@ use gleaner_lambda::Manifest;
 use gleaner_lambda::manifest::{ItemName, Sha256};
 use gleaner_protocol::supervision::{EventKind, LAMBDAS_MAX};
 use gleaner_protocol::vehicle_api::{DeployReply, DeployRequest, MissingObject};
-use gleaner_trust::{Revision, Trusted};
+use gleaner_trust::{Revision, Trusted, Verifier};
 
 use crate::checked::SignedDeployment;
 use crate::compile;
@@ -58,7 +58,8 @@ impl Core {
             sent.or_else(|| self.store.envelope(digest).ok())
         };
         let verify = |inner: &Inner| {
-            let verifier = inner.trust.verifier()?;
+            let known = inner.known_revisions();
+            let verifier = Verifier { known: &known, ..inner.trust.verifier()? };
             SignedDeployment::verify(&verifier, request.deployment.as_bytes(), find)
         };
         let mut signed = verify(&inner)?;
@@ -285,6 +286,13 @@ impl Core {
 }
 
 impl Inner {
+    /// Returns the revisions that ran here by the present deployments, and their fallbacks.
+    fn known_revisions(&self) -> Vec<Sha256> {
+        let ran = self.state.deployments.values().flat_map(|deployed| &deployed.history);
+        let signed = self.signed.values().flatten().flat_map(SignedDeployment::digests);
+        ran.chain(signed).cloned().collect()
+    }
+
     /// Notes the files that a deployment needs.
     fn expect(&mut self, id: &ItemName, objects: &[MissingObject]) -> Result<(), Failure> {
         if self.expected.len() >= OFFERS_MAX && !self.expected.contains_key(id) {

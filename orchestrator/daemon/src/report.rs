@@ -2,9 +2,14 @@
 
 use std::collections::BTreeMap;
 
+use gleaner_base::{Exit, Failure};
 use gleaner_lambda::manifest::ItemName;
+use gleaner_lambda::{BuildDir, Manifest};
 use gleaner_protocol::supervision::SupervisorStatus;
-use gleaner_protocol::vehicle_api::{Capacity, DeploymentStatus};
+use gleaner_protocol::vehicle_api::{
+    Capacity, DeploymentEnvelopes, DeploymentStatus, RevisionEnvelope,
+};
+use gleaner_trust::{sha256, unverified_deployment};
 
 use crate::core::Core;
 use crate::state::Deployed;
@@ -41,6 +46,32 @@ impl Core {
         removed.map(|(id, release)| (id.to_string(), release)).collect()
     }
 
+    /// Returns the signed parts of a deployment.
+    ///
+    /// # Errors
+    ///
+    /// A failure if there is no such deployment, or a revision of it cannot be read.
+    pub(crate) fn envelopes(&self, id: &str) -> Result<DeploymentEnvelopes, Failure> {
+        let inner = self.lock();
+        let name = id.parse::<ItemName>().ok();
+        let deployed = name.and_then(|name| inner.state.deployments.get(&name));
+        let deployment = deployed.ok_or_else(|| inner.unknown(id))?.envelope.clone();
+        drop(inner);
+        let wish = unverified_deployment(deployment.as_bytes())
+            .map_err(|refusal| Failure::because("the deployment cannot be read", &refusal))?;
+        let revisions = std::iter::once(&wish.revision).chain(&wish.fallback).map(|digest| {
+            let envelope = self.store.envelope(digest).map_err(|error| {
+                let action = format!("cannot read the revision {digest}");
+                Failure::caused_by(Exit::Internal, action, &error)
+            })?;
+            let envelope = String::from_utf8_lossy(&envelope).into_owned();
+            let build = BuildDir::of(self.store.folder(digest));
+            Ok(RevisionEnvelope { envelope, manifest: Manifest::read(build.path())? })
+        });
+        let revisions = revisions.collect::<Result<_, Failure>>()?;
+        Ok(DeploymentEnvelopes { deployment, revisions })
+    }
+
     /// Returns whether there is a deployment of this id, or records of one that was removed.
     pub(crate) fn has_records(&self, id: &ItemName) -> bool {
         self.lock().state.deployments.contains_key(id) || self.spools.join(id.as_str()).is_dir()
@@ -59,6 +90,7 @@ fn refused(id: &ItemName, deployed: &Deployed, reason: &str) -> DeploymentStatus
     DeploymentStatus {
         id: id.to_string(),
         release: deployed.release,
+        envelope: sha256(deployed.envelope.as_bytes()).to_string(),
         attempt: deployed.attempt,
         lambda: deployed.lambda.to_string(),
         is_wanted: deployed.is_wanted,

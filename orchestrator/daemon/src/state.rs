@@ -23,6 +23,19 @@ pub(crate) struct VehicleState {
     /// Deployments that were removed and whose records are kept, the newest last.
     #[serde(default)]
     pub(crate) removed: Vec<ItemName>,
+    /// The newest state of the cloud that was followed.
+    #[serde(default)]
+    pub(crate) followed: FollowedState,
+}
+
+/// A state of a cloud.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct FollowedState {
+    /// SHA-256 of the certificate of the cloud's authority: another cloud counts on its own.
+    pub(crate) authority: String,
+    /// Its number.
+    pub(crate) generation: u64,
 }
 
 impl VehicleState {

@@ -110,7 +110,13 @@ impl VehicleTrust {
             return Err(Failure::new(Exit::Denied, message)
                 .with_help("install one: `gleaner trust install FILE`"));
         };
-        Ok(Verifier { root, floors: &self.floors, labels: &self.labels, now: self.now() })
+        Ok(Verifier {
+            root,
+            floors: &self.floors,
+            labels: &self.labels,
+            now: self.now(),
+            known: &[],
+        })
     }
 
     /// Remembers an accepted deployment.

@@ -43,6 +43,9 @@ pub struct VehicleStatus {
     /// The connection to the cloud; absent unless the vehicle is enrolled.
     #[serde(default)]
     pub cloud: Option<CloudStatus>,
+    /// Time since the vehicle reported it, in s; only a cloud states it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub age_s: Option<f64>,
 }
 
 /// The connection of a vehicle to the cloud.
@@ -101,6 +104,9 @@ pub struct DeploymentStatus {
     pub id: String,
     /// Number of its release.
     pub release: u64,
+    /// SHA-256 of its signed envelope: of one number, there may be several.
+    #[serde(default)]
+    pub envelope: String,
     /// Number of the attempt to run it: the status of its lambda with a lower one is of an earlier
     /// attempt.
     pub attempt: u64,
@@ -112,6 +118,9 @@ pub struct DeploymentStatus {
     pub fallback: Option<RevisionStatus>,
     /// Rights of the lambda.
     pub grants: GrantStatus,
+    /// Values of the lambda's config that it sets, by their names.
+    #[serde(default)]
+    pub config: BTreeMap<String, String>,
     /// True unless it was stopped by a user.
     pub is_wanted: bool,
     /// True if its fallback runs.
@@ -208,6 +217,26 @@ pub struct DeployRequest {
     pub deployment: String,
     /// The envelopes of its revision and its fallback; one that the vehicle has may be left out.
     pub revisions: Vec<String>,
+}
+
+/// The signed parts of a deployment: `GET /v1/deployments/ID/envelopes`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct DeploymentEnvelopes {
+    /// The envelope of the deployment.
+    pub deployment: String,
+    /// Its revision, and then its fallback.
+    pub revisions: Vec<RevisionEnvelope>,
+}
+
+/// A revision of a deployment, as it was signed.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct RevisionEnvelope {
+    /// Its envelope, which has the digest of the manifest.
+    pub envelope: String,
+    /// Its manifest.
+    pub manifest: String,
 }
 
 /// The answer to a deployment.

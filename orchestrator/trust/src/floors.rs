@@ -167,13 +167,21 @@ impl Floors {
         check(&self.lambdas, name, || lambda(name), release, revision.digest())
     }
 
-    /// Checks a fallback, which may have a lower release than one accepted before.
-    pub(crate) fn check_fallback(&self, fallback: &Trusted<Revision>) -> Result<(), Refusal> {
+    /// Checks a fallback, which may have a lower release than one accepted before if it `is_known`
+    /// here.
+    pub(crate) fn check_fallback(
+        &self,
+        fallback: &Trusted<Revision>,
+        is_known: bool,
+    ) -> Result<(), Refusal> {
         let (name, release) = (&fallback.payload().name, fallback.payload().release);
         match self.lambdas.get(name) {
             Some(floor) if release == floor.release && *fallback.digest() != floor.digest => {
                 let (accepted, found) = (floor.digest.clone(), fallback.digest().clone());
                 Err(Refusal::SameRelease { what: lambda(name), release, accepted, found })
+            }
+            Some(floor) if release < floor.release && !is_known => {
+                Err(Refusal::UnknownFallback { fallback: release, floor: floor.release })
             }
             _ => Ok(()),
         }

@@ -36,6 +36,6 @@ pub use payload::{
 pub use publish::{Published, Release, ReleaseError, publish};
 pub use refusal::Refusal;
 pub use verify::{
-    Trusted, Verdict, Verifier, first_root, next_root, revision_of_digest, unverified_deployment,
-    unverified_revision,
+    Trusted, Verdict, Verifier, deployment_of_keys, first_root, next_root, revision_of_digest,
+    unverified_deployment, unverified_revision,
 };

@@ -45,6 +45,10 @@ pub enum Refusal {
     OtherLambda { revision: LambdaName, fallback: LambdaName },
     #[error("the fallback has release {fallback}, its revision {revision}; it must be older")]
     NewerFallback { fallback: u64, revision: u64 },
+    #[error(
+        "the fallback has release {fallback} and never ran here; release {floor} was accepted before"
+    )]
+    UnknownFallback { fallback: u64, floor: u64 },
     #[error("`{path}` of the revision is missing")]
     MissingFile { path: String },
     #[error("`{path}` is not in the revision")]
@@ -99,6 +103,9 @@ impl Explain for Refusal {
             }
             Self::NewerFallback { .. } => {
                 "sign the deployment again, with an older release as the fallback or without one"
+            }
+            Self::UnknownFallback { .. } => {
+                "sign the deployment again with a fallback that ran on the vehicle, or without one"
             }
             Self::Expired { what: TrustRoot::NAME, .. } => {
                 "install the next trust root; if the vehicle's clock is ahead, set it"

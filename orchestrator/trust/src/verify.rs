@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use gleaner_lambda::manifest::{LambdaName, Sha256};
 
 use crate::envelope::Unverified;
-use crate::{Deployment, Floors, Labels, Payload, Refusal, Revision, RootKeys};
+use crate::{Deployment, Floors, Labels, Payload, PublicKey, Refusal, Revision, RootKeys};
 use crate::{ScopedKey, TrustRoot};
 
 /// A payload with a valid signature of a key that counts on this vehicle.
@@ -55,6 +55,9 @@ pub struct Verifier<'a> {
     pub labels: &'a Labels,
     /// The time by [`Floors::now`].
     pub now: u64,
+    /// Digests of revisions that ran here, or that an accepted deployment has as its fallback: only
+    /// these may be the fallback of a new one although a later release was accepted.
+    pub known: &'a [Sha256],
 }
 
 impl Verifier<'_> {
@@ -133,7 +136,9 @@ impl Verifier<'_> {
             return Ok(expired.map_or(Verdict::Current, Verdict::Stale));
         }
         self.floors.check_new(deployment, revision)?;
-        fallback.map_or(Ok(()), |fallback| self.floors.check_fallback(fallback))?;
+        if let Some(fallback) = fallback {
+            self.floors.check_fallback(fallback, self.known.contains(&fallback.digest))?;
+        }
         expired.map_or(Ok(Verdict::Current), Err)
     }
 
@@ -235,6 +240,18 @@ pub fn revision_of_digest(envelope: &[u8], digest: &Sha256) -> Result<Revision, 
     }
     let (wanted, found) = (digest.to_string(), Some(found));
     Err(Refusal::OtherRevision { role: "revision", wanted, found })
+}
+
+/// Opens the deployment in `envelope`, which one of `keys` must have signed. This is for those who
+/// sign the next one: a vehicle asks for more.
+///
+/// # Errors
+///
+/// The first reason that is found.
+pub fn deployment_of_keys(envelope: &[u8], keys: &[PublicKey]) -> Result<Deployment, Refusal> {
+    let envelope = Unverified::<Deployment>::parse(envelope)?;
+    envelope.signers(keys)?;
+    envelope.payload()
 }
 
 /// Reads the revision in `envelope`, and its digest. No signature is checked: this is for those who

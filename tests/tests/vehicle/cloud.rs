@@ -63,7 +63,8 @@ pub fn follows() {
     let (cloud, mut vehicle) = enrolled();
     assert!(cloud.vehicle(NAME).state == VehicleState::Online);
     let lambda = ticker("rust", "ticks");
-    let other = deploy((&cloud, &vehicle), &lambda, "deployer", &["--selector", "town=bergen"]);
+    let other =
+        deploy((&cloud, &vehicle), &lambda, "deployer", &["--selector", "town=bergen", "--yes"]);
     assert!(other.status.success() && text(&other).contains("no vehicle"), "{}", text(&other));
     assert_eq!(phase(&vehicle, "ticks"), None, "it is for vehicles elsewhere");
     // The wave has the only vehicle, so that the last one has no others.
@@ -79,7 +80,7 @@ pub fn follows() {
         let lines = cloud.records(NAME, Some("ticks"));
         lines.iter().any(|line| line.kind == "decision").then_some(())
     });
-    cloud.succeeds(&["stop", "ticks", "--fleet"]);
+    cloud.succeeds(&["stop", "ticks", "--fleet", "--yes"]);
     vehicle.until("the lambda to stop", |vehicle| {
         (!vehicle.deployment("ticks").is_wanted).then_some(())
     });
@@ -93,7 +94,7 @@ pub fn follows() {
     vehicle.until_running(&["ticks"]);
     let local = ticker("rust", "local");
     vehicle.deploys(local.path());
-    cloud.succeeds(&["remove", "ticks", "--fleet"]);
+    cloud.succeeds(&["remove", "ticks", "--fleet", "--yes"]);
     vehicle.until("the removal", |vehicle| {
         let ids = vehicle.status().deployments.into_iter().map(|it| it.id);
         (ids.collect::<Vec<_>>() == ["local"]).then_some(())
@@ -165,7 +166,7 @@ pub fn killed() {
         });
         until_all_events(&cloud, &vehicle);
     }
-    assert_eq!(cloud.vehicle(NAME).problems, Vec::<String>::new());
+    assert_eq!(cloud.vehicle(NAME).problems, []);
 }
 
 pub fn refused() {

@@ -4,7 +4,8 @@ use serde_json::{Value, json};
 use super::*;
 
 fn rollout(goal: Goal) -> Rollout {
-    Rollout { id: "brake".to_owned(), selector: BTreeMap::new(), goal }
+    let (id, envelope) = ("brake".to_owned(), Some("e2".to_owned()));
+    Rollout { id, selector: Selector::new(), envelope, goal, plan: FleetPlan::default() }
 }
 
 /// A status with these deployments, each of which has these fields.
@@ -12,7 +13,7 @@ fn status(deployments: &[Value]) -> VehicleStatus {
     let mut all = Vec::new();
     for fields in deployments {
         let mut deployment = json!({
-            "id": "brake", "release": 2, "attempt": 5, "lambda": "brake",
+            "id": "brake", "release": 2, "envelope": "e2", "attempt": 5, "lambda": "brake",
             "revision": { "digest": "new", "version": "0.2.0", "release": 2 },
             "fallback": { "digest": "old", "version": "0.1.0", "release": 1 },
             "grants": { "topics": [], "models": [], "record": false },
@@ -38,7 +39,7 @@ fn lambda(phase: &str, attempt: u64) -> Value {
 }
 
 fn judge(goal: Goal, fields: Value) -> Standing {
-    rollout(goal).judge(&status(&[fields]), &[])
+    rollout(goal).judge(goal, &status(&[fields]), &[])
 }
 
 const NEW: Goal = Goal::Revision { release: 2 };
@@ -48,14 +49,17 @@ fn a_vehicle_is_done_once_it_runs_the_new_revision() {
     let done = Standing::Done("runs 0.2.0".to_owned());
     assert_eq!(judge(NEW, json!({ "status": lambda("running", 5) })), done);
     for (fields, reason) in [
-        (json!({}), "its lambda has not started"),
-        (json!({ "status": lambda("running", 4) }), "its lambda has not started"),
+        (json!({}), "it has not confirmed a start yet"),
+        (json!({ "status": lambda("running", 4) }), "it has not confirmed a start yet"),
         (json!({ "status": lambda("starting", 5) }), "its lambda is starting"),
-        (json!({ "release": 1, "status": lambda("running", 5) }), "it has release 1"),
+        (
+            json!({ "envelope": "other", "status": lambda("running", 5) }),
+            "it has another deployment, with release 2",
+        ),
     ] {
         assert_eq!(judge(NEW, fields), Standing::Pending(reason.to_owned()));
     }
-    let absent = rollout(NEW).judge(&status(&[]), &[]);
+    let absent = rollout(NEW).judge(NEW, &status(&[]), &[]);
     assert_eq!(absent, Standing::Pending("it does not have the deployment yet".to_owned()));
 }
 
@@ -66,7 +70,11 @@ fn a_vehicle_that_will_not_run_the_new_revision_has_failed_with_the_reason() {
     for (fields, exit, reason) in [
         (json!({ "refused": "no key" }), Exit::Denied, "it refuses it: no key"),
         (fallback, Exit::LambdaFaulted, "it runs its fallback 0.1.0: it faults"),
-        (json!({ "release": 3 }), Exit::Differs, "it has release 3"),
+        (
+            json!({ "release": 3, "envelope": "other" }),
+            Exit::Differs,
+            "it has another deployment, with release 3",
+        ),
         (
             json!({ "status": lambda("quarantined", 5) }),
             Exit::LambdaFaulted,
@@ -75,11 +83,26 @@ fn a_vehicle_that_will_not_run_the_new_revision_has_failed_with_the_reason() {
     ] {
         assert_eq!(judge(NEW, fields), Standing::Failed(exit, reason.to_owned()));
     }
-    let problems = ["deployment `other`: x".to_owned(), "deployment `brake`: no key".to_owned()];
-    let judged = rollout(NEW).judge(&status(&[]), &problems);
-    assert_eq!(judged, Standing::Failed(Exit::Denied, problems[1].clone()));
-    let judged = rollout(NEW).judge(&status(&[]), &problems[..1]);
-    assert!(matches!(judged, Standing::Pending(_)));
+    let problem = |deployment: &str, envelope: &str, is_pending| WantedProblem {
+        deployment: deployment.to_owned(),
+        envelope: envelope.to_owned(),
+        title: "no key".to_owned(),
+        is_pending,
+        ..WantedProblem::default()
+    };
+    let judge = |problem| rollout(NEW).judge(NEW, &status(&[]), &[problem]);
+    let refused = judge(problem("brake", "e2", false));
+    assert_eq!(refused, Standing::Failed(Exit::Denied, "no key".to_owned()));
+    assert_eq!(judge(problem("brake", "e2", true)), Standing::Pending("no key".to_owned()));
+    // Of another deployment, and of an earlier one of this id.
+    for (id, envelope) in [("other", "e2"), ("brake", "e1")] {
+        let absent = Standing::Pending("it does not have the deployment yet".to_owned());
+        assert_eq!(judge(problem(id, envelope, false)), absent);
+    }
+    // Another deployment with the same number, and the refusal of this one.
+    let other = status(&[json!({ "envelope": "e1", "status": lambda("running", 5) })]);
+    let judged = rollout(NEW).judge(NEW, &other, &[problem("brake", "e2", false)]);
+    assert_eq!(judged, refused);
 }
 
 #[test]
@@ -103,7 +126,7 @@ fn a_stop_and_a_removal_wait_for_the_end_of_the_lambda() {
         VehicleStatus { supervisor: Some(SupervisorStatus { lambdas, ..supervisor() }), ..status }
     };
     let stopped = || status(&[json!({ "is_wanted": false })]);
-    let judge = |goal, status: VehicleStatus| rollout(goal).judge(&status, &[]);
+    let judge = |goal, status: VehicleStatus| rollout(goal).judge(goal, &status, &[]);
     let ends = json!([lambda("stopping", 5)]);
     for (goal, applied) in [(Goal::Stopped, stopped()), (Goal::Removed, status(&[]))] {
         assert!(judge(goal, supervised(applied.clone(), json!([]))).is_done());

@@ -117,7 +117,8 @@ pub(super) fn head(figures: &VehicleFigures, width: usize) -> Vec<String> {
         format!("{}{state}{memory}{restarts}", service.name)
     });
     let capacity = figures.capacity.iter().map(shared);
-    let vehicle = [visible(&figures.vehicle), trust];
+    let age = figures.age_s.map(|age_s| format!("as of {age_s:.0} s ago"));
+    let vehicle = [visible(&figures.vehicle), trust].into_iter().chain(age);
     let programs = [format!("orchestrator {}", program(&figures.orchestrator)), supervisor];
     let mut lines = wrapped(vehicle, width);
     lines.extend(wrapped(programs, width));

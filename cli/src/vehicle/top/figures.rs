@@ -14,6 +14,8 @@ use crate::render::live_losses;
 #[derive(Debug, Serialize)]
 pub(super) struct VehicleFigures {
     pub(super) vehicle: String,
+    /// Age of a status of a cloud, in s.
+    pub(super) age_s: Option<f64>,
     pub(super) trust: Option<TrustStatus>,
     pub(super) capacity: Vec<Capacity>,
     pub(super) orchestrator: ProgramFigures,
@@ -83,6 +85,7 @@ impl VehicleFigures {
         let cpu_percent = percent(growth(orchestrator, now, earlier.clone()));
         Self {
             vehicle: now.vehicle.clone(),
+            age_s: now.age_s,
             trust: now.trust.clone(),
             capacity: now.capacity.clone(),
             orchestrator: ProgramFigures { cpu_percent, rss_bytes: now.orchestrator.rss_bytes },

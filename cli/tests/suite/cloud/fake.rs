@@ -27,6 +27,8 @@ pub struct SeenRequest {
 struct Table {
     answers: BTreeMap<String, VecDeque<(u16, Value)>>,
     seen: Vec<SeenRequest>,
+    /// SHA-256 of the envelope of the deployment that was sent last: answers have it for `$sent`.
+    sent: String,
 }
 
 /// The server. It ends with the process.
@@ -85,6 +87,11 @@ impl FakeServer {
         self.table.lock().unwrap().answers.insert(line.to_owned(), answers);
     }
 
+    /// Returns the answer that is set for a request.
+    pub fn answer(&self, line: &str) -> Value {
+        self.table.lock().unwrap().answers[line][0].1.clone()
+    }
+
     /// Returns the requests so far, and forgets them.
     pub fn seen(&self) -> Vec<SeenRequest> {
         std::mem::take(&mut self.table.lock().unwrap().seen)
@@ -106,6 +113,11 @@ fn answer(
     let line = format!("{method} {uri}");
     let authorization = headers.get(header::AUTHORIZATION);
     let authorization = authorization.map(|value| value.to_str().unwrap().to_owned());
+    if line == "POST /v1/deployments" {
+        let request: Value = serde_json::from_slice(body).unwrap();
+        let envelope = request["deployment"].as_str().unwrap();
+        table.sent = gleaner_trust::sha256(envelope.as_bytes()).to_string();
+    }
     table.seen.push(SeenRequest { line: line.clone(), authorization, body: body.to_owned() });
     let Some(answers) = table.answers.get_mut(&line) else {
         let (status, exit) = (StatusCode::NOT_FOUND, 2);
@@ -121,6 +133,9 @@ fn answer(
         // Lines of a stream.
         Value::String(text) => (status, text).into_response(),
         Value::Null => status.into_response(),
-        value => (status, axum::Json(value)).into_response(),
+        value => {
+            let text = value.to_string().replace("$sent", &table.sent);
+            (status, [(header::CONTENT_TYPE, "application/json")], text).into_response()
+        }
     }
 }

@@ -2,15 +2,22 @@
 
 use std::fs;
 
+use gleaner_lambda::manifest::{LambdaKind, Sha256};
 use gleaner_protocol::vehicle_api::DeployRequest;
-use gleaner_trust::{Deployment, Floors, Labels, Verifier};
+use gleaner_trust::{
+    Deployment, Floors, Grants, Labels, Revision, RevisionFile, SecretKey, Verifier, seal, sha256,
+    unverified_revision,
+};
 use serde_json::{Value, json};
 
 use super::CloudUser;
+use super::fake::SeenRequest;
 use super::vehicles::status;
 use crate::programs;
 
 const MANIFEST: &str = "lambda = { name = 'brake', version = '0.2.0', kind = 'python', entry = 'main.py' }\nschedule.period = '1s'\n";
+
+const INPUT: &str = "input = [{ name = 'imu', topic = '/imu', type = 'sensor_msgs/msg/Imu' }]\n";
 
 const DEPLOY: [&str; 5] = ["deploy", "brake", "--fleet", "--key", "key.pem"];
 
@@ -26,8 +33,60 @@ impl CloudUser {
         user.done(&["publish", "brake", "--key", "key.pem"]);
         user.cloud.answers("GET /v1/deployments", &[(200, list(json!([])))]);
         user.cloud.answers("POST /v1/deployments", &[(200, accepted())]);
+        user.reports(&[]);
         user.cloud.seen();
         user
+    }
+
+    /// Sets the releases that vehicles have reported.
+    fn reports(&self, reported: &[(&str, u64)]) {
+        let reported = reported.iter().map(|(name, it)| json!({ "vehicle": name, "release": it }));
+        let reported = (200, reported.collect());
+        self.cloud.answers("GET /v1/deployments/brake/reported", &[reported]);
+    }
+
+    /// Sets the deployment that the cloud has, which the deployer of this key has signed: version
+    /// 0.1.0, with the rights that its manifest asks for and one more. Returns the digest of its
+    /// revision.
+    fn has_former(&self, release: u64, key: &str) -> Sha256 {
+        let manifest = MANIFEST.replace("0.2.0", "0.1.0") + INPUT;
+        let revision = Revision {
+            name: "brake".parse().unwrap(),
+            version: "0.1.0".parse().unwrap(),
+            kind: LambdaKind::Python,
+            release: 1,
+            created: 1,
+            files: vec![RevisionFile {
+                path: "lambda.toml".parse().unwrap(),
+                bytes: manifest.len() as u64,
+                sha256: sha256(manifest.as_bytes()),
+            }],
+        };
+        let key = SecretKey::load(&self.path(key)).unwrap();
+        let text = |envelope: Vec<u8>| String::from_utf8(envelope).unwrap();
+        let envelope = text(seal(&revision, &[&key]).unwrap());
+        let (_, digest) = unverified_revision(envelope.as_bytes()).unwrap();
+        let deployment = Deployment {
+            id: "brake".parse().unwrap(),
+            release,
+            selector: Labels::new(),
+            revision: digest.clone(),
+            fallback: None,
+            config: Default::default(),
+            grants: Grants {
+                topics: vec!["/cabin".parse().unwrap(), "/imu".parse().unwrap()],
+                ..Grants::default()
+            },
+            created: 1,
+            expires: 2,
+        };
+        let parts = json!({
+            "deployment": text(seal(&deployment, &[&key]).unwrap()),
+            "revisions": [{ "envelope": envelope, "manifest": manifest }],
+        });
+        self.cloud.answers("GET /v1/deployments", &[(200, list(json!([in_cloud(release)])))]);
+        self.cloud.answers("GET /v1/deployments/brake/envelopes", &[(200, parts)]);
+        digest
     }
 
     /// Sets the vehicles of the cloud, each with its labels.
@@ -53,7 +112,8 @@ impl CloudUser {
         let root = programs::trusting(&self.done(&["keys", "show", "key.pem", "--json"]));
         let labels = Labels::from([("site".parse().unwrap(), "berlin".to_owned())]);
         let floors = Floors::default();
-        let vehicle = Verifier { root: &root, floors: &floors, labels: &labels, now: 0 };
+        let vehicle =
+            Verifier { root: &root, floors: &floors, labels: &labels, now: 0, known: &[] };
         let seen = self.cloud.seen();
         let request = seen.iter().rfind(|it| it.line == "POST /v1/deployments").unwrap();
         let request: DeployRequest = serde_json::from_slice(&request.body).unwrap();
@@ -72,7 +132,7 @@ fn accepted() -> Value {
 
 fn on_vehicle(release: u64, phase: &str) -> Value {
     json!({
-        "id": "brake", "release": release, "attempt": 5, "lambda": "brake",
+        "id": "brake", "release": release, "envelope": "$sent", "attempt": 5, "lambda": "brake",
         "revision": { "digest": "new", "version": "0.2.0", "release": 1 },
         "fallback": null, "grants": { "topics": [], "models": [], "record": false },
         "is_wanted": true, "runs_fallback": false, "is_proven": false,
@@ -83,9 +143,17 @@ fn on_vehicle(release: u64, phase: &str) -> Value {
     })
 }
 
+/// The deployment on a vehicle, with another envelope than the one that was sent.
+fn other_on_vehicle(release: u64, phase: &str) -> Value {
+    let mut deployment = on_vehicle(release, phase);
+    deployment["envelope"] = json!("other");
+    deployment
+}
+
 fn in_cloud(release: u64) -> Value {
     json!({
-        "id": "brake", "release": release, "version": "v", "revision": "b".repeat(64),
+        "id": "brake", "release": release, "envelope": "$sent", "version": "v",
+        "revision": "b".repeat(64),
         "fallback": "a".repeat(64),
         "grants": { "topics": ["/imu"], "models": [], "record": true },
         "selector": { "site": "berlin" }, "is_wanted": true, "vehicles": 2, "running": 1,
@@ -93,10 +161,20 @@ fn in_cloud(release: u64) -> Value {
     })
 }
 
+/// The answer with a status of a vehicle whose supervisor has no lambda.
+fn ended(deployments: &[Value]) -> (u16, Value) {
+    let mut status = status(deployments);
+    status["supervisor"] = json!({
+        "generation": 1, "up_s": 1.0, "lambdas": [], "clips": 0, "events_lost": 0,
+        "ingress": { "is_ready": true, "restarts": 0 },
+    });
+    (200, status)
+}
+
 #[test]
 fn a_deployment_to_a_fleet_sends_missing_files_and_waits_for_each_vehicle() {
     let user = CloudUser::with_lambda();
-    user.cloud.answers("GET /v1/deployments", &[(200, list(json!([in_cloud(6)])))]);
+    let former = user.has_former(6, "key.pem");
     let main = "x = 0\n";
     let digest = gleaner_base::hex(&<sha2::Sha256 as sha2::Digest>::digest(main));
     let missing = json!({
@@ -115,12 +193,14 @@ fn a_deployment_to_a_fleet_sends_missing_files_and_waits_for_each_vehicle() {
     ]);
     let running = on_vehicle(7, "running");
     user.statuses("car-7", std::slice::from_ref(&running));
-    user.statuses("car-9", &[on_vehicle(6, "running"), on_vehicle(7, "starting"), running]);
+    user.statuses("car-9", &[other_on_vehicle(7, "running"), on_vehicle(7, "starting"), running]);
     let arguments = [&DEPLOY[..], &["--selector", "site=berlin"]].concat();
     let text = user.done(&arguments);
     assert_eq!(
         text,
-        "deployed brake 0.2.0 as `brake` (release 7, 1 file sent)\n\
+        "fallback: brake 0.1.0 (release 1)\ngrants no longer: topic /cabin\n\
+         `brake` is updated on 2 vehicles: car-7, car-9\n\
+         deployed brake 0.2.0 as `brake` (release 7, 1 file sent)\n\
          car-7: runs 0.2.0\ncar-9: runs 0.2.0\n`brake` runs on 2 vehicles\n"
     );
     let seen = user.cloud.seen();
@@ -133,8 +213,92 @@ fn a_deployment_to_a_fleet_sends_missing_files_and_waits_for_each_vehicle() {
     assert_eq!(json["vehicles"][1]["state"], "done", "{json}");
     let sent = user.sent();
     assert_eq!((sent.release, sent.selector.len()), (7, 1));
-    assert_eq!(sent.fallback.unwrap().to_string(), "b".repeat(64));
-    assert_eq!((sent.grants.topics.len(), sent.grants.record), (1, true));
+    // Of what the cloud states, nothing is signed: only what the manifest of the fallback asks for.
+    assert_eq!(sent.fallback, Some(former));
+    let topics: Vec<_> = sent.grants.topics.iter().map(ToString::to_string).collect();
+    assert_eq!((topics, sent.grants.record), (vec!["/imu".to_owned()], false));
+}
+
+#[test]
+fn what_no_key_of_the_deployer_signed_is_no_part_of_the_next_signature() {
+    let user = CloudUser::with_lambda();
+    user.vehicles(&[("car-7", "online", json!({ "site": "berlin" }))]);
+    user.statuses("car-7", &[on_vehicle(7, "running")]);
+    user.done(&["keys", "new", "stranger.pem"]);
+    user.has_former(6, "stranger.pem");
+    let text = user.fails(3, &DEPLOY);
+    assert!(text.contains("the deployment before this one cannot be verified"), "{text}");
+    assert!(text.contains("--trust FILE"), "{text}");
+    // By hand, or with the trust root that has the other deployer.
+    let chosen = [&DEPLOY[..], &["--release", "7", "--fallback", "none"]].concat();
+    user.done(&chosen);
+    assert!(user.sent().fallback.is_none());
+    let keys = ["--publisher", "key.pem", "--deployer", "stranger.pem", "--root", "key.pem"];
+    user.done(&[&["trust", "new", "root.json"][..], &keys].concat());
+    user.done(&[&DEPLOY[..], &["--trust", "root.json"]].concat());
+    let sent = user.sent();
+    assert!(sent.fallback.is_some() && sent.release == 7);
+    // Another manifest than the signed one, which asks for more.
+    let line = "GET /v1/deployments/brake/envelopes";
+    user.has_former(6, "key.pem");
+    let mut parts = user.cloud.answer(line);
+    parts["revisions"][0]["manifest"] = json!(MANIFEST.to_owned() + INPUT);
+    user.cloud.answers(line, &[(200, parts)]);
+    let text = user.fails(3, &DEPLOY);
+    assert!(text.contains("another manifest than that of revision"), "{text}");
+    // One of the same deployer for another id, and none that can be fetched.
+    let id = ["--id", "other"];
+    user.has_former(6, "key.pem");
+    for change in ["/envelopes", "/reported"] {
+        let answer = match change {
+            "/envelopes" => user.cloud.answer(line),
+            _ => json!([]),
+        };
+        user.cloud.answers(&format!("GET /v1/deployments/other{change}"), &[(200, answer)]);
+    }
+    let mut other = in_cloud(6);
+    other["id"] = json!("other");
+    user.cloud.answers("GET /v1/deployments", &[(200, list(json!([other])))]);
+    let text = user.fails(3, &[&DEPLOY[..], &id].concat());
+    assert!(text.contains("is of another id: `brake`"), "{text}");
+    user.has_former(6, "key.pem");
+    user.cloud.answers(line, &[(500, super::fake::problem(1, "damaged"))]);
+    user.fails(1, &DEPLOY);
+    user.done(&chosen);
+}
+
+#[test]
+fn a_change_that_takes_something_away_is_asked_for() {
+    let user = CloudUser::with_lambda();
+    user.has_former(6, "key.pem");
+    user.vehicles(&[
+        ("car-7", "online", json!({ "site": "berlin" })),
+        ("car-8", "online", json!({ "site": "paris" })),
+    ]);
+    let moved = [&DEPLOY[..], &["--label", "site=paris"]].concat();
+    let text = user.fails(2, &moved);
+    assert!(text.contains("`brake` is removed from 1 vehicle: car-7"), "{text}");
+    let text = user.fails(2, &["stop", "brake", "--fleet"]);
+    assert!(text.contains("`brake` stops on 1 vehicle: car-7"), "{text}");
+    let text = user.fails(2, &[&DEPLOY[..], &["--label", "site=parise"]].concat());
+    assert!(text.contains("`brake` is removed from 1 vehicle: car-7"), "{text}");
+    // Vehicles that have an older release lose it, too.
+    let mut several = in_cloud(6);
+    several["older_selectors"] = json!([{ "site": "paris" }]);
+    user.cloud.answers("GET /v1/deployments", &[(200, list(json!([several])))]);
+    let text = user.fails(2, &["remove", "brake", "--fleet"]);
+    assert!(text.contains("`brake` is removed from 2 vehicles: car-7, car-8"), "{text}");
+    user.has_former(6, "key.pem");
+    let changes = |it: &SeenRequest| !it.line.starts_with("GET ");
+    assert!(!user.cloud.seen().iter().any(changes), "nothing was sent");
+    // The vehicle that loses it is waited for, too.
+    user.cloud.answers("GET /v1/vehicles/car-7/status", &[ended(&[on_vehicle(6, "running")])]);
+    user.statuses("car-8", &[on_vehicle(7, "running")]);
+    let accepted = [&moved[..], &["--yes"]].concat();
+    let text = user.fails(4, &[&accepted[..], &["--timeout", "1ms"]].concat());
+    assert!(text.contains("car-7: it has not followed the change yet"), "{text}");
+    user.cloud.answers("GET /v1/vehicles/car-7/status", &[ended(&[])]);
+    assert!(user.done(&accepted).contains("car-7: is removed\n"));
 }
 
 #[test]
@@ -147,7 +311,7 @@ fn the_error_of_a_fleet_names_each_vehicle_and_its_reason() {
     ]);
     user.statuses("car-7", &[on_vehicle(1, "running")]);
     user.statuses("car-8", &[on_vehicle(1, "quarantined")]);
-    user.statuses("car-9", &[on_vehicle(0, "running")]);
+    user.statuses("car-9", &[other_on_vehicle(1, "running")]);
     let arguments = [&DEPLOY[..], &["--timeout", "1ms", "--release", "1"]].concat();
     let text = user.fails(6, &arguments);
     assert!(text.starts_with("error: `brake` runs on 1 of 3 vehicles\n"), "{text}");
@@ -163,24 +327,28 @@ fn the_error_of_a_fleet_names_each_vehicle_and_its_reason() {
 fn a_deployment_without_a_vehicle_yet_is_no_error() {
     let user = CloudUser::with_lambda();
     user.vehicles(&[("car-8", "online", json!({ "site": "paris" }))]);
-    let text = user.done(&[&DEPLOY[..], &["--label", "site=berlin"]].concat());
+    let text = user.fails(4, &[&DEPLOY[..], &["--label", "site=berln"]].concat());
+    assert!(text.contains("no vehicle matches") && text.contains("site=berln"), "{text}");
+    let text = user.done(&[&DEPLOY[..], &["--label", "site=berlin", "--yes"]].concat());
     assert!(text.contains("no vehicle has the labels yet"), "{text}");
     assert_eq!(user.sent().release, 1);
 }
 
 #[test]
-fn the_release_follows_those_that_vehicles_remember() {
+fn a_release_that_vehicles_would_refuse_is_not_signed_unless_it_is_named() {
     let user = CloudUser::with_lambda();
-    user.vehicles(&[("car-7", "online", json!({})), ("car-8", "offline", json!({}))]);
-    let mut removed = status(&[]);
-    removed["removed"] = json!({ "brake": 9 });
-    let done = (200, status(&[on_vehicle(10, "running")]));
-    user.cloud.answers("GET /v1/vehicles/car-7/status", &[(200, removed), done.clone()]);
-    user.cloud.answers("GET /v1/vehicles/car-8/status", &[done]);
-    // The cloud knows no deployment of this name, but a vehicle runs release 10 of one.
-    let text = user.fails(4, &[&DEPLOY[..], &["--timeout", "1ms"]].concat());
-    assert!(text.contains("car-8: it is offline, seen"), "{text}");
-    assert_eq!(user.sent().release, 11);
+    user.vehicles(&[("car-7", "online", json!({})), ("car-8", "revoked", json!({}))]);
+    user.statuses("car-7", &[on_vehicle(10, "running")]);
+    // The cloud has no deployment of this name, and a vehicle had one. It may be any number. That
+    // of a vehicle that does not get it does not count.
+    for reported in [9, u64::MAX] {
+        user.reports(&[("car-8", u64::MAX), ("car-7", reported)]);
+        let text = user.fails(3, &DEPLOY);
+        assert!(text.contains("this would be release 1 of `brake`"), "{text}");
+        assert!(text.contains(&format!("car-7 reports release {reported}")), "{text}");
+    }
+    user.done(&[&DEPLOY[..], &["--release", "10"]].concat());
+    assert_eq!(user.sent().release, 10);
 }
 
 #[test]
@@ -191,23 +359,20 @@ fn a_deployment_of_a_fleet_is_listed_changed_and_removed() {
     let words: Vec<_> = text.lines().nth(1).unwrap().split_whitespace().collect();
     let row = ["brake", "6", "bbbbbbbbbbbb", "site=berlin", "wanted", "2", "1", "0"];
     assert_eq!(words, row);
-    assert_eq!(user.json(&["fleet"]), json!([in_cloud(6)]));
+    let mut stored = in_cloud(6);
+    stored["envelope"] = json!("");
+    assert_eq!(user.json(&["fleet"]), json!([stored]));
     user.vehicles(&[("car-7", "online", json!({ "site": "berlin" }))]);
-    let ended = |deployments: &[Value]| {
-        let mut status = status(deployments);
-        status["supervisor"] = json!({
-            "generation": 1, "up_s": 1.0, "lambdas": [], "clips": 0, "events_lost": 0,
-            "ingress": { "is_ready": true, "restarts": 0 },
-        });
-        (200, status)
-    };
     let mut stopped = on_vehicle(6, "running");
     stopped["is_wanted"] = json!(false);
     stopped["status"] = json!(null);
     user.cloud.answers("POST /v1/deployments/brake/stop", &[(200, in_cloud(6))]);
     user.cloud.answers("GET /v1/vehicles/car-7/status", &[ended(&[stopped])]);
-    let text = user.done(&["stop", "brake", "--fleet"]);
-    assert_eq!(text, "car-7: is stopped\n`brake` is stopped on 1 vehicle\n");
+    let text = user.done(&["stop", "brake", "--fleet", "--yes"]);
+    assert_eq!(
+        text,
+        "`brake` stops on 1 vehicle: car-7\ncar-7: is stopped\n`brake` is stopped on 1 vehicle\n"
+    );
     user.cloud.answers("POST /v1/deployments/brake/start", &[(200, in_cloud(6))]);
     user.statuses("car-7", &[on_vehicle(6, "starting"), on_vehicle(6, "running")]);
     assert!(user.done(&["start", "brake", "--fleet"]).ends_with("`brake` runs on 1 vehicle\n"));
@@ -216,8 +381,10 @@ fn a_deployment_of_a_fleet_is_listed_changed_and_removed() {
     assert!(text.contains("car-7: it has no fallback"), "{text}");
     user.cloud.answers("DELETE /v1/deployments/brake", &[(204, json!(null))]);
     user.cloud.answers("GET /v1/vehicles/car-7/status", &[ended(&[])]);
-    assert!(user.done(&["remove", "brake", "--fleet"]).contains("is removed on 1 vehicle"));
-    let text = user.fails(2, &["stop", "other", "--fleet"]);
+    assert!(
+        user.done(&["remove", "brake", "--fleet", "--yes"]).contains("is removed on 1 vehicle")
+    );
+    let text = user.fails(2, &["stop", "other", "--fleet", "--yes"]);
     assert!(text.contains("the cloud has no deployment `other`"), "{text}");
 }
 
@@ -239,9 +406,11 @@ fn in_waves(release: u64, wave: u64, state: &str, reason: &str) -> Value {
 fn a_deployment_in_waves_sends_its_plan_and_can_be_watched() {
     let user = CloudUser::with_lambda();
     let deployments = |all: &[Value]| {
+        user.has_former(6, "key.pem");
         let answers = all.iter().map(|it| (200, list(json!([it])))).collect::<Vec<_>>();
         user.cloud.answers("GET /v1/deployments", &answers);
     };
+    user.vehicles(&[("car-7", "online", json!({ "site": "berlin" }))]);
     let waves = ["--wave", "5%", "--canary", "50", "--success", "90%"];
     let deploy = [&DEPLOY[..], &waves].concat();
     deployments(&[in_cloud(6), in_waves(7, 1, "running", "")]);
@@ -255,7 +424,6 @@ fn a_deployment_in_waves_sends_its_plan_and_can_be_watched() {
     assert_eq!(sent["waves"], in_waves(7, 1, "", "")["waves"]["plan"]);
     // Watched, it waits for the last wave, and then for all vehicles.
     let watch = [&deploy[..], &["--watch"]].concat();
-    user.vehicles(&[("car-7", "online", json!({}))]);
     user.statuses("car-7", &[on_vehicle(7, "running")]);
     deployments(&[in_cloud(6), in_waves(7, 2, "running", ""), in_cloud(7)]);
     let text = user.done(&watch);
@@ -263,13 +431,18 @@ fn a_deployment_in_waves_sends_its_plan_and_can_be_watched() {
         text.contains("wave 2 of 3") && text.ends_with("`brake` runs on 1 vehicle\n"),
         "{text}"
     );
-    deployments(&[in_cloud(6), in_waves(7, 1, "paused", "wave 1: it failed on 1 of 4 vehicles")]);
+    deployments(&[in_cloud(6), in_waves(7, 1, "paused", "failed on 1 of 4 (car-9: no key)")]);
     let text = user.fails(4, &watch);
-    assert!(text.contains("wave 1 of 3, paused: wave 1: it failed on 1 of 4 vehicles"), "{text}");
+    assert!(text.contains("wave 1 of 3 paused: failed on 1 of 4 (car-9: no key)"), "{text}");
     assert!(text.contains("gleaner fleet resume ID"), "{text}");
-    deployments(&[in_cloud(6), in_cloud(8)]);
+    let mut newer = in_cloud(8);
+    newer["envelope"] = json!("other");
+    deployments(&[in_cloud(6), newer]);
     let text = user.fails(4, &watch);
-    assert!(text.contains("release 7 of `brake` was replaced or removed meanwhile"), "{text}");
+    assert!(
+        text.contains("this deployment of `brake` was replaced or removed meanwhile"),
+        "{text}"
+    );
     for (options, reason) in
         [(&["--success", "90%"][..], "--wave"), (&["--wave", "101%"], "`101%` is no share")]
     {
@@ -283,9 +456,8 @@ fn a_deployment_in_waves_sends_its_plan_and_can_be_watched() {
 #[test]
 fn waves_are_listed_paused_resumed_and_aborted() {
     let user = CloudUser::logged_in();
-    let paused = in_waves(6, 2, "paused", "paused by ada");
-    let line =
-        "brake: wave 2 of 3, paused: paused by ada; it runs on 3 of 4 vehicles, and 1 failed\n";
+    let paused = in_waves(6, 2, "paused", "by ada");
+    let line = "brake: wave 2 of 3 paused by ada; it runs on 3 of 4 vehicles, and 1 failed\n";
     user.cloud.answers("GET /v1/deployments", &[(200, list(json!([paused])))]);
     assert!(user.done(&["fleet"]).ends_with(line));
     for change in ["pause", "resume", "abort"] {

@@ -23,7 +23,7 @@ fn vehicles_are_listed_enrolled_once_and_revoked() {
     let user = CloudUser::logged_in();
     let vehicles = json!([{
         "name": "car-7", "labels": {}, "state": "invited", "seen": null, "version": null,
-        "wanted": 1, "handled": 0, "problems": ["no trust root"], "running": 0, "deployments": 0,
+        "wanted": 1, "handled": 0, "problems": [{ "title": "no trust root" }], "running": 0, "deployments": 0,
     }]);
     user.cloud.answers("GET /v1/vehicles", &[(200, json!({ "items": vehicles }))]);
     assert!(user.done(&["vehicles"]).ends_with("car-7: no trust root\n"));

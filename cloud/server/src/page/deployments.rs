@@ -56,7 +56,7 @@ pub(super) async fn page(
     Query(query): Query<Done>,
 ) -> PageResult {
     let deployment = cloud.store.deployment(&id).await?;
-    let reports = cloud.store.reports(&id, deployment.release, VEHICLES_MAX).await?;
+    let reports = cloud.store.reports(&id, &deployment.envelope, VEHICLES_MAX).await?;
     let here = deployment_path(&id);
     let body = html! {
         nav.crumbs aria-label="Path" { a href="/deployments" { "Deployments" } }
@@ -111,7 +111,7 @@ fn waves_of(waves: &WaveProgress) -> Markup {
     html! {
         p {
             span.state.(class) { "Wave " (wave) " of " (all) ": " (state) }
-            @if !reason.is_empty() { " (" (shown(reason)) ")" }
+            @if !reason.is_empty() { " " (shown(reason)) }
             span.dim {
                 ". It has reached " (count(*vehicles, "vehicle")) ": " (running) " running, "
                 (failed) " failed. The others keep their release."
@@ -127,21 +127,23 @@ fn selector(deployment: &FleetDeployment) -> Markup {
     }
 }
 
-fn vehicles(reports: &[(String, String)]) -> Markup {
+fn vehicles(reports: &[(String, String, String)]) -> Markup {
     html! {
         @if !reports.is_empty() {
             section aria-labelledby="vehicles" {
                 h2 id="vehicles" { "Vehicles that have it" }
-                ul.columns { @for (vehicle, state) in reports {
+                ul.columns { @for (vehicle, state, reason) in reports {
                     li {
                         @let (class, text) = match &**state {
                             "running" => ("running", "running"),
                             "failed" => ("failed", "failed or refused"),
+                            "pending" => ("waiting", "not fetched yet"),
                             _ => ("other", "not running"),
                         };
                         a id=(format!("v-{vehicle}")) href=(vehicle_path(vehicle)) {
                             (shown(vehicle)) } " "
                         span.state.(class) { (text) }
+                        @if !reason.is_empty() { " " span.dim { (shown(reason)) } }
                     }
                 } }
                 @if reports.len() as i64 >= VEHICLES_MAX {
@@ -198,7 +200,8 @@ fn changes(user: &PageUser, here: &str, deployment: &FleetDeployment) -> Markup 
             section.card.changes aria-labelledby="changes" {
                 h2 id="changes" { "Change" }
                 @if deployment.is_wanted {
-                    (form(user, &format!("{here}/stop"), html! { button { "Stop" } }))
+                    (confirmed(user, &format!("{here}/stop"), "Stop",
+                        "Each vehicle will end it until it is started again.", html! {}))
                 } @else {
                     (form(user, &format!("{here}/start"), html! { button { "Start" } }))
                 }

@@ -80,6 +80,7 @@ pub(crate) fn routes() -> Vec<PageRoute> {
         read("/", Viewer, get(fleet::start)),
         read("/vehicles", Viewer, get(fleet::page)),
         read("/vehicles/{name}", Viewer, get(vehicle::page)),
+        send("/vehicles/{name}/agree", Admin, post(vehicle::agree)),
         read("/vehicles/{name}/events", Viewer, get(records::time_line)),
         read("/vehicles/{name}/events/stream", Viewer, get(stream::time_line)),
         read("/vehicles/{name}/lambdas/{id}", Viewer, get(records::lambda)),

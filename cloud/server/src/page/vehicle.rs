@@ -3,12 +3,13 @@
 use std::sync::Arc;
 
 use axum::extract::{Extension, Path, State};
-use gleaner_fleet::people::{VehicleState, VehicleSummary};
+use axum::response::{IntoResponse, Redirect};
+use gleaner_fleet::people::{Role, VehicleState, VehicleSummary};
 use gleaner_protocol::vehicle_api::VehicleStatus;
 use maud::{Markup, html};
 
 use super::fleet::state;
-use super::layout::{self, PageResult, empty};
+use super::layout::{self, PageResult, confirmed, empty};
 use super::session::PageUser;
 use super::status;
 use super::text::{ago, label, shown, vehicle_path};
@@ -27,6 +28,7 @@ pub(super) async fn page(
     let vehicle = find(&cloud, &name).await?;
     // Absent before the first report, and of a version whose status has another form.
     let status = cloud.store.status(&name).await.ok();
+    cloud.tails.watch(&vehicle.name);
     let status: Option<VehicleStatus> = status.and_then(|text| serde_json::from_str(&text).ok());
     let here = vehicle_path(&name);
     let body = html! {
@@ -36,16 +38,33 @@ pub(super) async fn page(
             a href=(here) aria-current="page" { "Status" }
             a href=(format!("{here}/events")) { "Time line" }
         }
+        (ahead(&user, &here, &vehicle))
         div id="vehicle" hx-get=(here) hx-trigger="every 5s" hx-select="#vehicle"
             hx-swap="outerHTML" {
             (summary(&vehicle))
             @match &status {
-                Some(status) => (status::all(&here, status)),
+                Some(status) => {
+                    @if let Some(age_s) = status.age_s {
+                        p.dim { "As of " (age_s.round()) " s ago" }
+                    }
+                    (status::all(&here, status))
+                }
                 None => (empty("The vehicle has not reported its status yet.")),
             }
         }
     };
     Ok(layout::page(&vehicle.name, "/vehicles", Some(&user), body))
+}
+
+/// Lets a vehicle follow this cloud although it has followed a newer state.
+pub(super) async fn agree(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(user): Extension<PageUser>,
+    Path(name): Path<String>,
+) -> PageResult {
+    cloud.store.agree(&user.user.name, &name).await?;
+    cloud.hub.wake(std::slice::from_ref(&name));
+    Ok(Redirect::to(&vehicle_path(&name)).into_response())
 }
 
 /// Returns a vehicle of the list.
@@ -61,10 +80,34 @@ pub(super) async fn find(cloud: &Cloud, name: &str) -> CloudResult<VehicleSummar
     })
 }
 
+/// Asks for the decision about a vehicle that has followed a newer state.
+fn ahead(user: &PageUser, here: &str, vehicle: &VehicleSummary) -> Markup {
+    html! {
+        @if vehicle.is_ahead {
+            div.banner.bad {
+                p { "The vehicle has followed a newer state than this cloud has, as after a restored \
+                    backup. It stops and removes nothing until an administrator agrees." }
+                @if user.user.role >= Role::Admin {
+                    (confirmed(user, &format!("{here}/agree"), "Follow this cloud",
+                        "The vehicle will end what this cloud does not have.", html! {}))
+                }
+            }
+        }
+    }
+}
+
 fn summary(vehicle: &VehicleSummary) -> Markup {
     html! {
+        @if vehicle.is_double {
+            p.banner.bad { "Two machines have the identity of this vehicle, and one of them is not let \
+                in. Run gleaner unenrol --new-identity on the copy, and enrol both again." }
+        }
         @for problem in vehicle.problems.iter().take(PROBLEMS_MAX) {
-            p.banner.bad { (shown(problem)) }
+            p.banner.bad[!problem.is_pending] {
+                @if !problem.deployment.is_empty() { (shown(&problem.deployment)) ": " }
+                (shown(&problem.in_words()))
+                @if !problem.help.is_empty() { ". " (shown(&problem.help)) }
+            }
         }
         @if vehicle.problems.len() > PROBLEMS_MAX {
             p.banner.bad { (vehicle.problems.len() - PROBLEMS_MAX) " more problems" }

@@ -5,6 +5,7 @@ use gleaner_fleet::people::ListPage;
 use schemars::JsonSchema;
 use serde::Deserialize;
 
+use super::wants::next_wanted;
 use super::{CloudStore, int, unsigned};
 use crate::error::{CloudError, CloudResult};
 use crate::request::PageLimit;
@@ -120,7 +121,7 @@ impl CloudStore {
             change.note(actor, "pull clip", &id.to_string()).await?;
             // The vehicle reads its orders again with each new number.
             run!(&mut *change.tx;
-                "UPDATE vehicles SET generation = generation + 1 WHERE name = $1"; id.vehicle());
+                concat!("UPDATE vehicles SET ", next_wanted!(), " WHERE name = $1"); id.vehicle());
         }
         change.commit().await?;
         self.clip(id).await

@@ -7,7 +7,9 @@ use gleaner_fleet::clips::{
     ClipFacts, ClipId, ClipName, ClipOrders, ClipPolicy, ClipReport, GoneClip, WantedClip,
 };
 
+use super::numbers::check_number;
 use super::vehicles::ended;
+use super::wants::next_wanted;
 use super::{CloudStore, StoreChange, int, now, unsigned};
 use crate::error::{CloudError, CloudResult};
 
@@ -238,7 +240,7 @@ impl CloudStore {
             "UPDATE clips SET parts = parts + 1, part_time = $4, reason = '',
              state = CASE WHEN $5 = 1 THEN 'stored' ELSE state END
              WHERE vehicle = $1 AND name = $2 AND parts = $3 AND state = 'vehicle'";
-            id.vehicle(), id.name(), int(*part), now(), i64::from(is_last));
+            id.vehicle(), id.name(), int(*part), self.age_now(), i64::from(is_last));
         if stored.rows_affected() > 0 {
             run!(&mut *change.tx;
                 "INSERT INTO clip_parts (clip, part, sha256)
@@ -312,7 +314,7 @@ impl CloudStore {
 
     /// Forgets the parts of files of which none came since `seconds`; returns these clips.
     pub(crate) async fn forget_unfinished_clips(&self, seconds: u64) -> CloudResult<Vec<ClipId>> {
-        let before = now() - int(seconds);
+        let before = self.age_now() - int(seconds);
         let mut change = self.change().await?;
         let rows: Vec<(String, String)> = rows!(&mut *change.tx;
             "UPDATE clips SET parts = 0
@@ -341,6 +343,7 @@ impl CloudStore {
     ) -> CloudResult<Vec<String>> {
         let mut change = self.change().await?;
         let ClipPolicy { upload, day_bytes, keep_s, keep_bytes } = policy;
+        check_number("a bound of clips", *day_bytes.max(keep_s).max(keep_bytes))?;
         run!(&mut *change.tx;
             "UPDATE clip_policy SET upload = $1, day_bytes = $2, keep_s = $3, keep_bytes = $4";
             upload.as_str(), int(*day_bytes), int(*keep_s), int(*keep_bytes));
@@ -350,8 +353,8 @@ impl CloudStore {
         }
         change.note(actor, "set policy of clips", &text).await?;
         let vehicles: Vec<(String,)> = rows!(&mut *change.tx;
-            "UPDATE vehicles SET generation = generation + 1 WHERE is_revoked = 0 AND epoch > 0
-             RETURNING name");
+            concat!("UPDATE vehicles SET ", next_wanted!(),
+                " WHERE is_revoked = 0 AND epoch > 0 RETURNING name"));
         change.commit().await?;
         Ok(vehicles.into_iter().map(|(name,)| name).collect())
     }

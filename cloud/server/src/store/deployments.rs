@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use gleaner_base::excerpt;
-use gleaner_fleet::people::FleetDeployment;
+use gleaner_fleet::people::{FleetDeployment, ReportedRelease};
 use gleaner_fleet::waves::WavePlan;
 use gleaner_protocol::vehicle_api::GrantStatus;
 
@@ -23,7 +23,7 @@ const RELEASES_MAX: i64 = 8;
 pub(super) const COMPLETE: &str = "complete";
 
 /// A deployment that was sent, with its revisions.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(crate) struct OfferedDeployment {
     pub(crate) id: String,
     pub(crate) release: u64,
@@ -181,14 +181,19 @@ impl CloudStore {
         for release in releases {
             let all = release.count(&mut tx, false).await?;
             let waves = release.progress(&mut tx).await?;
+            let others: Vec<(String,)> = rows!(&mut *tx;
+                "SELECT DISTINCT selector FROM releases WHERE deployment = $1 AND number <> $2";
+                &release.deployment, release.number);
             deployments.push(FleetDeployment {
                 version: release.version(),
                 id: release.deployment,
                 release: unsigned(release.number),
+                envelope: release.sha256,
                 revision: release.revision,
                 fallback: (!release.fallback.is_empty()).then_some(release.fallback),
                 grants: serde_json::from_str(&release.grants).unwrap_or_default(),
                 selector: map(&release.selector),
+                older_selectors: others.iter().map(|(selector,)| map(selector)).collect(),
                 is_wanted: release.is_wanted != 0,
                 vehicles: all.vehicles,
                 running: all.running,
@@ -198,6 +203,28 @@ impl CloudStore {
             });
         }
         Ok(deployments)
+    }
+
+    /// Returns the highest releases of a deployment that vehicles have reported, at most `most`.
+    pub(crate) async fn reported_releases(
+        &self,
+        id: &str,
+        most: i64,
+    ) -> CloudResult<Vec<ReportedRelease>> {
+        let rows: Vec<(String, i64)> = rows!(&self.pool;
+            "SELECT vehicle, number FROM reported JOIN vehicles ON name = vehicle
+             WHERE deployment = $1 AND number > 0 AND is_revoked = 0
+             ORDER BY number DESC, vehicle LIMIT $2";
+            id, most);
+        let release = |(vehicle, number)| ReportedRelease { vehicle, release: unsigned(number) };
+        Ok(rows.into_iter().map(release).collect())
+    }
+
+    /// Returns the envelope of the newest release of a deployment.
+    pub(crate) async fn newest_envelope(&self, id: &str) -> CloudResult<String> {
+        let row: Option<(String,)> = row!(&self.pool;
+            "SELECT envelope FROM releases WHERE deployment = $1 ORDER BY number DESC LIMIT 1"; id);
+        row.map(|(envelope,)| envelope).ok_or_else(|| unknown(id))
     }
 
     /// Returns the envelope of a deployment with this SHA-256.
@@ -225,7 +252,7 @@ impl StoreChange<'_> {
         }
         // The waves of an older release go on no more: vehicles that have it get this one, too.
         run!(&mut *self.tx;
-            "UPDATE releases SET state = 'aborted', since = $2, reason = 'a newer release came'
+            "UPDATE releases SET state = 'aborted', since = $2, reason = 'as a newer release came'
              WHERE deployment = $1 AND state IN ('running', 'paused')";
             id, now());
         run!(&mut *self.tx;

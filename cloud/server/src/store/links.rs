@@ -2,16 +2,17 @@
 
 use std::collections::{BTreeMap, HashMap};
 
-use gleaner_base::excerpt;
-use gleaner_fleet::{Cursor, Hello};
+use gleaner_base::{excerpt, in_one_line};
+use gleaner_fleet::{Cursor, Hello, WantedProblem};
 use gleaner_protocol::supervision::LambdaPhase;
 use gleaner_protocol::vehicle_api::{DeploymentStatus, VehicleStatus};
 
-use super::vehicles::{FAILED, RUNNING, ended, json};
+use super::numbers::check_number;
+use super::vehicles::{FAILED, PENDING, RUNNING, ended, json};
 use super::wants::WishedVehicle;
-use super::writer::{GroupVehicles, VehicleWrite, Waiting, WaitingWrite, counting};
-use super::{CloudStore, StoreChange, in_list, int, list_parts, now, parts, unsigned};
-use crate::error::CloudResult;
+use super::writer::{DOUBLE, GroupVehicles, VehicleWrite, Waiting, WaitingWrite, counting};
+use super::{CloudStore, StoreChange, in_list, int, list_parts, now, now_ms, parts, unsigned};
+use crate::error::{CloudError, CloudResult};
 use crate::sqlx::{self, AssertSqlSafe};
 
 /// Maximum number of deployments in a report that count.
@@ -22,35 +23,64 @@ const DEPLOYMENTS_MAX: usize = 1000;
 pub(crate) struct VehicleReport {
     /// Number of the newest wanted state that it has handled.
     pub(crate) handled: u64,
-    pub(crate) problems: Vec<String>,
+    pub(crate) problems: Vec<WantedProblem>,
     pub(crate) version: String,
     pub(crate) labels: BTreeMap<String, String>,
-    /// Number and state of each deployment, by its id.
-    pub(crate) states: BTreeMap<String, (u64, &'static str)>,
+    /// The state of each deployment that it has or refuses, by its id and the SHA-256 of its
+    /// envelope.
+    pub(crate) states: BTreeMap<(String, String), DeploymentState>,
+    /// Number of the deployments that it has.
+    pub(crate) deployments: u64,
     /// The status, as JSON.
     pub(crate) status: String,
     /// False if an earlier report of the connection had the same states.
     pub(crate) has_new_states: bool,
 }
 
+/// The state of a deployment on a vehicle: [`RUNNING`], [`FAILED`], [`PENDING`], `removed` or
+/// `other`; and of one that does not run, the reason.
+#[derive(Debug, Default, Clone, PartialEq, Eq, Hash)]
+pub(crate) struct DeploymentState {
+    /// Number of the release that the vehicle has or had; 0 of one that it does not have.
+    pub(crate) release: u64,
+    pub(crate) state: &'static str,
+    pub(crate) reason: String,
+}
+
 impl VehicleReport {
     /// Returns the report of a vehicle with this status, which `json` states.
     pub(crate) fn new(
         handled: u64,
-        problems: Vec<String>,
+        problems: Vec<WantedProblem>,
         status: VehicleStatus,
         json: String,
     ) -> Self {
-        let deployments = status.deployments.into_iter().take(DEPLOYMENTS_MAX);
-        let states = deployments.map(|it| {
-            let state = state(&it);
-            (it.id, (it.release, state))
+        let all = status.deployments.len().min(DEPLOYMENTS_MAX);
+        let refused = problems.iter().map(|it| {
+            let state = if it.is_pending { PENDING } else { FAILED };
+            let reason = excerpt(&it.in_words());
+            (
+                (it.deployment.clone(), it.envelope.clone()),
+                DeploymentState { release: 0, state, reason },
+            )
         });
+        // What it has counts before what it could not change.
+        let deployments = status.deployments.into_iter().take(DEPLOYMENTS_MAX).map(|it| {
+            let state = state(&it);
+            ((excerpt(&it.id), excerpt(&it.envelope)), state)
+        });
+        let removed = status.removed.iter().take(DEPLOYMENTS_MAX).map(|(id, release)| {
+            let state =
+                DeploymentState { release: *release, state: "removed", ..Default::default() };
+            ((excerpt(id), String::new()), state)
+        });
+        let states = refused.chain(removed).chain(deployments).collect();
         Self {
             handled,
             problems,
             version: excerpt(&status.orchestrator.version),
-            states: states.collect(),
+            states,
+            deployments: all as u64,
             labels: status.labels,
             status: json,
             has_new_states: true,
@@ -58,15 +88,19 @@ impl VehicleReport {
     }
 }
 
-fn state(deployment: &DeploymentStatus) -> &'static str {
-    let phase = deployment.status.as_ref().map(|status| status.phase);
-    let has_failed = deployment.failed.is_some() || deployment.refused.is_some();
-    match phase {
-        _ if has_failed => FAILED,
-        Some(LambdaPhase::Quarantined) => FAILED,
+fn state(deployment: &DeploymentStatus) -> DeploymentState {
+    let lambda = deployment.status.as_ref();
+    let phase = lambda.map(|status| status.phase);
+    let quarantined = lambda.filter(|it| it.phase == LambdaPhase::Quarantined);
+    let reason = deployment.refused.as_ref().or(deployment.failed.as_ref());
+    let reason = reason.or(quarantined.and_then(|it| it.last_end.as_ref()));
+    let state = match phase {
+        _ if reason.is_some() || quarantined.is_some() => FAILED,
         Some(LambdaPhase::Running) => RUNNING,
         _ => "other",
-    }
+    };
+    let reason = reason.map(|it| excerpt(&in_one_line(it))).unwrap_or_default();
+    DeploymentState { release: deployment.release, state, reason }
 }
 
 /// A connection that begins.
@@ -75,6 +109,10 @@ pub(super) struct ConnectWrite {
     certificate: String,
     version: String,
     key: String,
+    /// Number of the newest wanted state that it has followed.
+    followed: u64,
+    /// Boot of its machine.
+    boot: String,
     /// The process that has the connection.
     replica: String,
 }
@@ -122,10 +160,13 @@ impl CloudStore {
         certificate: &str,
         hello: &Hello,
     ) -> CloudResult<(u64, Vec<Cursor>)> {
+        // It is counted up.
+        check_number("twice the followed wanted state", hello.followed.saturating_mul(2))?;
         let (name, certificate) = (name.to_owned(), certificate.to_owned());
         let (version, key) = (excerpt(&hello.version), excerpt(&hello.key));
+        let (followed, boot) = (hello.followed, excerpt(&hello.boot));
         let replica = self.replica().to_owned();
-        self.write(ConnectWrite { name, certificate, version, key, replica }).await
+        self.write(ConnectWrite { name, certificate, version, key, followed, boot, replica }).await
     }
 
     /// Stores a report, if the connection still counts; returns whether the vehicle's wanted state
@@ -136,8 +177,17 @@ impl CloudStore {
         epoch: u64,
         report: VehicleReport,
     ) -> CloudResult<bool> {
+        report.check_numbers()?;
         self.write(ReportWrite { name: name.to_owned(), epoch, report }).await
     }
+}
+
+/// Returns the error of a machine that has come back although another one has its identity.
+fn double(name: &str) -> CloudError {
+    let message = format!("another machine has the identity of `{name}`, and is let in instead");
+    let help = "run `gleaner unenrol --new-identity` on the copy, and enrol it under a name of its \
+                own; enrol the other one again";
+    CloudError::denied(message, help)
 }
 
 /// Valid certificates by vehicle: the SHA-256 and the end of each.
@@ -156,7 +206,7 @@ impl StoreChange<'_> {
         // The newest connection of each vehicle.
         let mut begun = BTreeMap::new();
         for waiting in connects.iter_mut() {
-            let ConnectWrite { name, certificate, .. } = &waiting.write;
+            let ConnectWrite { name, certificate, followed, boot, .. } = &waiting.write;
             let all = certificates.entry(name.clone()).or_default();
             let used = all.iter().find(|(sha256, _)| sha256 == certificate);
             let expires = used.map(|(_, expires)| *expires).filter(|expires| *expires > now());
@@ -165,38 +215,58 @@ impl StoreChange<'_> {
                 waiting.result = Some(Err(ended()));
                 continue;
             };
+            if !vehicle.admits(boot) {
+                waiting.result = Some(Err(double(name)));
+                begun.insert(name.clone(), vehicle.clone());
+                continue;
+            }
             // Used, a certificate is durable on the vehicle, and replaces the former ones.
             replaced
                 .extend(all.extract_if(.., |(_, end)| *end < expires).map(|(sha256, _)| sha256));
             vehicle.epoch += 1;
+            if int(*followed) > vehicle.offered {
+                // Also if others have counted the number meanwhile: it stands for another state.
+                // Later states have numbers above those that the vehicle knows.
+                vehicle.generation = vehicle.generation.max(int(*followed)) + 1;
+                vehicle.is_ahead = 1;
+            }
+            vehicle.offered = vehicle.generation;
             waiting.result = Some(Ok((unsigned(vehicle.epoch), Vec::new())));
-            begun.insert(name.clone(), vehicle.epoch);
+            begun.insert(name.clone(), vehicle.clone());
         }
         let mut cursors = self.cursors_of(&begun.keys().collect::<Vec<_>>()).await?;
         let mut rows = Vec::new();
         for waiting in connects.iter_mut() {
             let ConnectWrite { name, version, key, replica, .. } = &waiting.write;
             let Some(Ok((epoch, positions))) = &mut waiting.result else { continue };
-            if begun.get(name) == Some(&int(*epoch)) {
+            if let Some(vehicle) = begun.get(name).filter(|it| it.epoch == int(*epoch)) {
                 *positions = cursors.remove(name).unwrap_or_default();
-                rows.push((name, *epoch, [version, key, replica]));
+                let [boot, former] = &vehicle.boots;
+                rows.push((name, vehicle, [version, key, replica, boot, former]));
             }
         }
         for part in parts(&rows) {
             let sql = format!(
-                "INSERT INTO vehicles (name, epoch, version, clip_key, replica, seen) VALUES {}
-                 ON CONFLICT (name) DO UPDATE SET epoch = excluded.epoch,
-                 version = excluded.version, clip_key = excluded.clip_key,
+                "INSERT INTO vehicles
+                 (name, epoch, generation, offered, is_ahead, is_double, version, clip_key, replica,
+                 boot, former_boot, seen) VALUES {} ON CONFLICT (name) DO UPDATE SET epoch = excluded.epoch,
+                 generation = excluded.generation, offered = excluded.offered,
+                 is_ahead = excluded.is_ahead, is_double = excluded.is_double,
+                 boot = excluded.boot, former_boot = excluded.former_boot, version = excluded.version, clip_key = excluded.clip_key,
                  replica = excluded.replica, seen = excluded.seen",
-                self.placeholders(part.len(), 6)
+                self.placeholders(part.len(), 12)
             );
             let mut query = sqlx::query(AssertSqlSafe(sql));
-            for (name, epoch, texts) in part {
-                query = query.bind(*name).bind(int(*epoch));
+            for (name, it, texts) in part {
+                query = query.bind(*name).bind(it.epoch).bind(it.generation).bind(it.offered);
+                query = query.bind(it.is_ahead).bind(it.is_double);
                 query = texts.iter().fold(query, |query, text| query.bind(*text)).bind(now());
             }
             query.execute(&mut *self.tx).await?;
         }
+        let doubles = begun.iter().filter(|(_, it)| it.is_double == DOUBLE);
+        let doubles: Vec<_> = doubles.map(|(name, _)| name).collect();
+        self.run_in("UPDATE vehicles SET is_double = 2 WHERE name IN", &doubles).await?;
         self.run_in("DELETE FROM certificates WHERE sha256 IN", &replaced).await
     }
 
@@ -267,24 +337,27 @@ impl StoreChange<'_> {
         for part in parts(rows) {
             let sql = format!(
                 "INSERT INTO vehicles
-                 (name, handled, problems, status, labels, deployments, running, version)
+                 (name, handled, problems, status, reported_ms, labels, deployments, running,
+                 version)
                  VALUES {} ON CONFLICT (name) DO UPDATE SET handled = excluded.handled,
-                 problems = excluded.problems, status = excluded.status, labels = excluded.labels,
+                 problems = excluded.problems, status = excluded.status,
+                 reported_ms = excluded.reported_ms, labels = excluded.labels,
                  deployments = excluded.deployments, running = excluded.running,
                  version = excluded.version",
-                self.placeholders(part.len(), 8)
+                self.placeholders(part.len(), 9)
             );
             let mut query = sqlx::query(AssertSqlSafe(sql));
             for (name, (report, _)) in part {
                 let states = report.states.values();
-                let running = states.filter(|(_, state)| *state == RUNNING).count();
+                let running = states.filter(|it| it.state == RUNNING).count();
                 query = query
                     .bind(*name)
                     .bind(int(report.handled))
                     .bind(json(&report.problems))
                     .bind(&report.status)
+                    .bind(now_ms())
                     .bind(json(&report.labels))
-                    .bind(int(report.states.len() as u64))
+                    .bind(int(report.deployments))
                     .bind(int(running as u64))
                     .bind(&report.version);
             }
@@ -297,16 +370,18 @@ impl StoreChange<'_> {
         let names: Vec<_> = reports.iter().map(|(name, _)| *name).collect();
         self.run_in("DELETE FROM reported WHERE vehicle IN", &names).await?;
         let states = reports.iter().flat_map(|(name, report)| {
-            report.states.iter().map(move |(id, (number, state))| (*name, id, *number, *state))
+            report.states.iter().map(move |(key, state)| (*name, key, state))
         });
         for part in parts(&states.collect::<Vec<_>>()) {
             let sql = format!(
-                "INSERT INTO reported (vehicle, deployment, number, state) VALUES {}",
-                self.placeholders(part.len(), 4)
+                "INSERT INTO reported (vehicle, deployment, envelope, number, state, reason)
+                 VALUES {}",
+                self.placeholders(part.len(), 6)
             );
             let mut query = sqlx::query(AssertSqlSafe(sql));
-            for (name, id, number, state) in part {
-                query = query.bind(*name).bind(*id).bind(int(*number)).bind(*state);
+            for (name, (id, envelope), DeploymentState { release, state, reason }) in part {
+                query = query.bind(*name).bind(id).bind(envelope).bind(int(*release));
+                query = query.bind(*state).bind(reason);
             }
             query.execute(&mut *self.tx).await?;
         }

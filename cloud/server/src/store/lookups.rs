@@ -17,9 +17,12 @@ const GROUP_MAX: usize = 256;
 /// The certificates, with their ends and vehicles.
 pub(super) const CERTIFICATES: &str = "SELECT sha256, expires, vehicles.name FROM certificates
      JOIN vehicles ON vehicles.name = certificates.vehicle WHERE is_revoked = 0 AND sha256 IN";
-/// The vehicles, with the numbers and digests of their wanted states.
-pub(super) const WANTS: &str =
-    "SELECT name, generation, digest FROM vehicles WHERE is_revoked = 0 AND name IN";
+/// The vehicles, with the numbers and digests of their wanted states; after the digest, [`AHEAD`]
+/// of one that has followed a newer state.
+pub(super) const WANTS: &str = "SELECT name, generation,
+     CASE WHEN is_ahead = 0 THEN digest ELSE digest || ' ahead' END
+     FROM vehicles WHERE is_revoked = 0 AND name IN";
+pub(super) const AHEAD: &str = " ahead";
 /// The envelopes of deployments.
 pub(super) const ENVELOPES: &str = "SELECT sha256, number, envelope FROM releases WHERE sha256 IN";
 pub(super) const REVISIONS: &str =

@@ -33,6 +33,7 @@ macro_rules! rows {
 }
 
 mod address;
+mod age_clock;
 mod append;
 mod audit;
 mod awaited;
@@ -43,6 +44,7 @@ mod clips;
 mod deployments;
 mod links;
 mod lookups;
+mod numbers;
 mod page;
 mod record_age;
 mod records;
@@ -65,6 +67,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use gleaner_base::{Exit, Failure};
 use tokio::sync::{Mutex, MutexGuard};
 
+use self::age_clock::AgeClock;
 use self::lookups::LookupQueue;
 use self::wants::WantedStates;
 use self::writer::WriteQueue;
@@ -78,6 +81,7 @@ pub(crate) use clip_list::ClipQuery;
 pub(crate) use clips::{ClipBounds, ClipProgress};
 pub(crate) use deployments::OfferedDeployment;
 pub(crate) use links::VehicleReport;
+pub(crate) use numbers::NUMBER_MAX;
 pub(crate) use page::{LINE_MAX, NewestRecords, VehicleFilter, VehiclePage, large_line};
 pub(crate) use records::{RecordPage, Retention, StreamBatch, name_in_lines};
 pub(crate) use replicas::OwnLink;
@@ -102,6 +106,9 @@ const MIGRATIONS: &[&str] = &[
     include_str!("../../migrations/0010_chunks.sql"),
     include_str!("../../migrations/0011_tails.sql"),
     include_str!("../../migrations/0012_clip_parts.sql"),
+    include_str!("../../migrations/0013_reported_envelopes.sql"),
+    include_str!("../../migrations/0014_lives.sql"),
+    include_str!("../../migrations/0015_age_clock.sql"),
 ];
 
 /// Maximum number of queries at a time: with more threads than cores, each only takes longer.
@@ -122,6 +129,7 @@ pub(crate) struct CloudStore {
     envelopes: LookupQueue,
     revisions: LookupQueue,
     wanted: WantedStates,
+    ages: AgeClock,
     is_file: bool,
     /// Name of this process among those that serve the database.
     replica: String,
@@ -160,10 +168,12 @@ impl CloudStore {
             turn,
             writes,
             wanted,
+            ages: AgeClock::start(),
             is_file,
             replica,
         };
         store.migrate().await?;
+        store.count_age().await?;
         Ok(store)
     }
 
@@ -187,6 +197,12 @@ impl CloudStore {
             run!(&mut *change.tx; "INSERT INTO migrations (version) VALUES ($1)"; version);
         }
         change.commit().await
+    }
+
+    /// Returns the version of the database.
+    pub(crate) async fn version(&self) -> CloudResult<i64> {
+        let (version,): (i64,) = one!(&self.pool; "SELECT MAX(version) FROM migrations");
+        Ok(version)
     }
 
     /// Begins a change, once no other one is in progress.
@@ -325,7 +341,8 @@ pub(crate) fn now_ms() -> i64 {
     i64::try_from(since.as_millis()).unwrap_or(i64::MAX)
 }
 
-/// Converts a number for the database, which has no unsigned ones.
+/// Converts a number for the database, which has no unsigned ones. Numbers from outside are checked
+/// before, by `numbers`, but for positions and lengths of lists: nothing is beyond the largest one.
 fn int(number: u64) -> i64 {
     i64::try_from(number).unwrap_or(i64::MAX)
 }

@@ -57,6 +57,17 @@ pub(crate) struct NewestRecords {
 }
 
 impl CloudStore {
+    /// Returns the numbers of vehicles, and of releases, by their states.
+    pub(crate) async fn states(&self) -> CloudResult<(Vec<(String, i64)>, Vec<(String, i64)>)> {
+        let vehicles = rows!(&self.pool;
+            "SELECT CASE WHEN is_revoked <> 0 THEN 'revoked'
+             WHEN replica IN (SELECT id FROM replicas) THEN 'online'
+             WHEN epoch = 0 THEN 'invited' ELSE 'offline' END AS state, COUNT(*)
+             FROM vehicles GROUP BY 1");
+        let releases = rows!(&self.pool; "SELECT state, COUNT(*) FROM releases GROUP BY state");
+        Ok((vehicles, releases))
+    }
+
     /// Returns the `index`-th part, of `size` each, of the vehicles that `filter` chooses, by name.
     pub(crate) async fn vehicle_page(
         &self,
@@ -105,18 +116,18 @@ impl CloudStore {
         Ok(page)
     }
 
-    /// Returns the vehicles that have reported this release of a deployment, with their states:
-    /// first those with a failure, at most `most`.
+    /// Returns the vehicles that have reported the deployment of this envelope, with their states
+    /// and reasons: first those with a failure, at most `most`.
     pub(crate) async fn reports(
         &self,
         deployment: &str,
-        release: u64,
+        envelope: &str,
         most: i64,
-    ) -> CloudResult<Vec<(String, String)>> {
+    ) -> CloudResult<Vec<(String, String, String)>> {
         Ok(rows!(&self.pool;
-            "SELECT vehicle, state FROM reported WHERE deployment = $1 AND number = $2
+            "SELECT vehicle, state, reason FROM reported WHERE deployment = $1 AND envelope = $2
              ORDER BY CASE WHEN state = $3 THEN 0 ELSE 1 END, vehicle LIMIT $4";
-            deployment, int(release), FAILED, most))
+            deployment, envelope, FAILED, most))
     }
 
     /// Returns vehicles by name after this one, or from it on, and whether the filter chooses each

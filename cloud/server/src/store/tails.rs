@@ -2,10 +2,13 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use gleaner_fleet::TAIL_S;
+use gleaner_fleet::{STATUS_STREAM, TAIL_S};
 
 use super::{CloudStore, now};
 use crate::error::CloudResult;
+
+/// Time of a lease of a status, in s, which costs a whole report each second.
+const STATUS_S: i64 = 30;
 
 /// Streams of a vehicle that people read, and the end of their lease.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -26,7 +29,7 @@ impl CloudStore {
                 "INSERT INTO tails (vehicle, stream, until)
                  SELECT name, CAST($2 AS TEXT), CAST($3 AS BIGINT) FROM vehicles WHERE name = $1
                  ON CONFLICT (vehicle, stream) DO UPDATE SET until = excluded.until";
-                vehicle, stream, now() + i64::from(TAIL_S));
+                vehicle, stream, now() + if stream == STATUS_STREAM { STATUS_S } else { TAIL_S.into() });
         }
         let (count,): (i64,) = one!(&mut *change.tx; "SELECT COUNT(*) FROM tails");
         change.commit().await?;

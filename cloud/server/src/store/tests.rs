@@ -1,5 +1,5 @@
 use gleaner_fleet::people::{NewUser, Role, VehicleState};
-use gleaner_fleet::{Cursor, Hello};
+use gleaner_fleet::{Cursor, Hello, WantedProblem};
 use gleaner_protocol::vehicle_api::GrantStatus;
 use serde_json::{Value, json};
 use tempfile::TempDir;
@@ -8,6 +8,10 @@ use super::*;
 
 #[path = "../../tests/postgres/mod.rs"]
 mod postgres;
+
+mod ages;
+mod identity;
+mod numbers;
 
 const KEPT: Retention = Retention { records: 1000, bytes: 1 << 20, vehicle_bytes: 1 << 20 };
 
@@ -69,7 +73,18 @@ pub(super) fn report(labels: Value, deployments: Value) -> VehicleReport {
         "generation": 1, "deployments": deployments, "capacity": [], "supervisor": null,
     });
     let json = status.to_string();
-    VehicleReport::new(1, vec!["no room".to_owned()], serde_json::from_value(status).unwrap(), json)
+    VehicleReport::new(
+        1,
+        vec![problem("b", "", false)],
+        serde_json::from_value(status).unwrap(),
+        json,
+    )
+}
+
+fn problem(deployment: &str, envelope: &str, is_pending: bool) -> WantedProblem {
+    let (deployment, envelope) = (deployment.to_owned(), envelope.to_owned());
+    let title = "no room".to_owned();
+    WantedProblem { deployment, envelope, title, is_pending, ..WantedProblem::default() }
 }
 
 fn batch(life: u64, seqs: std::ops::Range<u64>) -> StreamBatch {
@@ -293,44 +308,6 @@ async fn a_release_is_replaced_only_by_a_higher_one() {
     store.deploy("ann", &with_fallback).await.unwrap();
     store.roll_back("ann", "a").await.unwrap();
     assert!(store.roll_back("ann", "b").await.unwrap_err().reason().contains("no deployment `b`"));
-}
-
-#[tokio::test]
-async fn vehicles_of_a_deployment_are_counted_by_what_they_report() {
-    let (_folder, store) = store().await;
-    let epoch = connected(&store, "car-7").await;
-    connected(&store, "car-8").await;
-    let deployment = OfferedDeployment { selector: [].into(), ..offered("a", 1, "test") };
-    store.deploy("ann", &deployment).await.unwrap();
-    let counts = async || {
-        let a = store.deployment("a").await.unwrap();
-        (a.vehicles, a.running, a.failed)
-    };
-    assert_eq!(counts().await, (2, 0, 0));
-    let status = |refused: Value, phase: &str| {
-        json!([{
-            "id": "a", "release": 1, "attempt": 1, "lambda": "a",
-            "revision": { "digest": "r", "version": "1", "release": 1 }, "fallback": null,
-            "grants": { "topics": [], "models": [], "record": false }, "is_wanted": true,
-            "runs_fallback": false, "is_proven": false, "failed": null, "refused": refused,
-            "stale": null,
-            "status": { "id": "a", "name": "a", "revision": "r", "attempt": 1, "phase": phase,
-                "phase_s": 1.0, "pid": null, "restarts": 0, "last_end": null, "live": null,
-                "layers": [] },
-        }])
-    };
-    for (refused, phase, expected) in
-        [(Value::Null, "running", (2, 1, 0)), (json!("no room"), "waiting", (2, 0, 1))]
-    {
-        store.report("car-7", epoch, report(json!({}), status(refused, phase))).await.unwrap();
-        assert_eq!(counts().await, expected);
-    }
-    // It has handled the wanted state that has the deployment, and does not have it.
-    let handled = VehicleReport { handled: 2, ..report(json!({}), json!([])) };
-    store.report("car-7", epoch, handled).await.unwrap();
-    assert_eq!(counts().await, (2, 0, 1));
-    let all = store.vehicles("", 10).await.unwrap();
-    assert_eq!((all[0].wanted, all[0].handled, &*all[0].problems[0]), (2, 2, "no room"));
 }
 
 #[tokio::test]

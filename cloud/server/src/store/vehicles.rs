@@ -7,7 +7,9 @@ use gleaner_fleet::people::{VehicleState, VehicleSummary};
 use gleaner_trust::VehicleName;
 
 use super::secrets::SecretKind;
-use super::{ChangeAuthor, CloudStore, StoreChange, in_list, int, now, parts, unsigned};
+use super::wants::next_wanted;
+use super::writer::DOUBLE;
+use super::{ChangeAuthor, CloudStore, StoreChange, in_list, int, now, now_ms, parts, unsigned};
 use crate::error::{CloudError, CloudResult};
 use crate::sqlx::{self, AssertSqlSafe};
 
@@ -22,7 +24,7 @@ pub(crate) struct Issued {
 
 impl CloudStore {
     /// Adds a vehicle, or lets one enrol again; returns the one-time token. One that is connected
-    /// stays so until the token is used.
+    /// stays so until the token is used. One that was cut off begins its streams again.
     pub(crate) async fn invite_vehicle(
         &self,
         author: impl Into<ChangeAuthor<'_>>,
@@ -36,6 +38,7 @@ impl CloudStore {
         }
         let mut change = self.change().await?;
         change.begin_request(author).await?;
+        change.begin_streams_of_revoked(name).await?;
         run!(&mut *change.tx;
             "INSERT INTO vehicles (name) VALUES ($1)
              ON CONFLICT (name) DO UPDATE SET is_revoked = 0";
@@ -65,6 +68,9 @@ impl CloudStore {
         }
         let issued = issue()?;
         change.add_certificate(name, &issued).await?;
+        // Only the machine that has used the token is known from now on.
+        run!(&mut *change.tx;
+            "UPDATE vehicles SET is_double = 0, boot = '', former_boot = '' WHERE name = $1"; name);
         change.note(name, "enrol", name).await?;
         change.commit().await?;
         Ok(Some(issued))
@@ -106,6 +112,24 @@ impl CloudStore {
         change.commit().await
     }
 
+    /// Lets a vehicle follow the state of this cloud although it has followed a newer one.
+    pub(crate) async fn agree(
+        &self,
+        author: impl Into<ChangeAuthor<'_>>,
+        name: &str,
+    ) -> CloudResult<()> {
+        let author = author.into();
+        let mut change = self.change().await?;
+        let found = run!(&mut *change.tx;
+            concat!("UPDATE vehicles SET ", next_wanted!(), ", is_ahead = 0 WHERE name = $1");
+            name);
+        if found.rows_affected() == 0 {
+            return Err(unknown(name));
+        }
+        change.note(author.name, "agree to the restored state", name).await?;
+        change.commit().await
+    }
+
     /// Returns the vehicle with the certificate of this SHA-256, if it is valid.
     pub(crate) async fn vehicle_of(&self, sha256: &str) -> CloudResult<Option<String>> {
         let found = self.certificates.find(sha256).await?;
@@ -124,18 +148,20 @@ impl CloudStore {
         Ok(rows.into_iter().map(summary).collect())
     }
 
-    /// Returns the newest status of a vehicle, as JSON.
+    /// Returns the newest status of a vehicle, as JSON with its age.
     pub(crate) async fn status(&self, name: &str) -> CloudResult<String> {
-        let status: Option<(String,)> =
-            row!(&self.pool; "SELECT status FROM vehicles WHERE name = $1"; name);
-        match status {
-            None => Err(unknown(name)),
-            Some((status,)) if status.is_empty() => Err(CloudError::missing(
+        let status: Option<(String, i64)> =
+            row!(&self.pool; "SELECT status, reported_ms FROM vehicles WHERE name = $1"; name);
+        let (status, reported_ms) = status.ok_or_else(|| unknown(name))?;
+        // What is stored was parsed as an object, without an age.
+        let Some(fields) = status.trim_end().strip_suffix('}') else {
+            return Err(CloudError::missing(
                 format!("vehicle `{name}` has not reported yet"),
                 "enrol it, and start its orchestrator",
-            )),
-            Some((status,)) => Ok(status),
-        }
+            ));
+        };
+        let age_s = (now_ms() - reported_ms).max(0) as f64 / 1000.0;
+        Ok(format!("{fields},\"age_s\":{age_s}}}"))
     }
 
     /// Stores the times of the last signs of life.
@@ -163,6 +189,28 @@ impl CloudStore {
 }
 
 impl StoreChange<'_> {
+    /// Begins the next life of each stream of a vehicle that was cut off, and its list of clips: no
+    /// number that a thief may have sent stands for records of the one that is enrolled, and no
+    /// mere announcement for its clips.
+    async fn begin_streams_of_revoked(&mut self, name: &str) -> CloudResult<()> {
+        const IS_REVOKED: &str =
+            "EXISTS (SELECT 1 FROM vehicles WHERE vehicles.name = $1 AND is_revoked = 1)";
+        const ANNOUNCED: &str = "vehicle = $1 AND state <> 'stored' AND parts = 0";
+        for change in [
+            "UPDATE streams SET life = life + 1, next = 0, seq = 0, boot = '', boot_ns = 0
+             WHERE vehicle = $1",
+            "UPDATE clip_vehicles SET position = '' WHERE vehicle = $1",
+            &format!(
+                "DELETE FROM clip_words WHERE clip IN (SELECT seq FROM clips WHERE {ANNOUNCED})"
+            ),
+            &format!("DELETE FROM clips WHERE {ANNOUNCED}"),
+        ] {
+            let sql = format!("{change} AND {IS_REVOKED}");
+            sqlx::query(AssertSqlSafe(sql)).bind(name).execute(&mut *self.tx).await?;
+        }
+        Ok(())
+    }
+
     /// Adds a certificate. In the database, each ends after the former ones, by which the newest
     /// is known.
     async fn add_certificate(&mut self, name: &str, issued: &Issued) -> CloudResult<()> {
@@ -187,7 +235,7 @@ impl StoreChange<'_> {
 macro_rules! vehicle_columns {
     () => {
         "SELECT name, is_revoked, epoch, seen, version, labels, generation, handled, problems,
-         running, deployments,
+         running, deployments, is_ahead, is_double, clip_key,
          CASE WHEN replica IN (SELECT id FROM replicas) THEN 1 ELSE 0 END FROM vehicles"
     };
 }
@@ -195,17 +243,20 @@ pub(super) use vehicle_columns;
 
 /// The values from which the summary of a vehicle is made.
 pub(super) type VehicleRow =
-    (String, i64, i64, i64, String, String, i64, i64, String, i64, i64, i64);
+    (String, i64, i64, i64, String, String, i64, i64, String, i64, i64, i64, i64, String, i64);
 
 pub(super) fn summary(row: VehicleRow) -> VehicleSummary {
     let (name, is_revoked, epoch, seen, version, labels, wanted, handled, problems, ..) = row;
     VehicleSummary {
         labels: serde_json::from_str(&labels).unwrap_or_default(),
-        state: vehicle_state(is_revoked, epoch, row.11),
+        state: vehicle_state(is_revoked, epoch, row.14),
         seen: (seen > 0).then_some(unsigned(seen)),
         version: (!version.is_empty()).then_some(version),
+        key: row.13,
         wanted: unsigned(wanted),
         handled: unsigned(handled),
+        is_ahead: row.11 != 0,
+        is_double: row.12 >= DOUBLE,
         problems: serde_json::from_str(&problems).unwrap_or_default(),
         running: unsigned(row.9),
         deployments: unsigned(row.10),
@@ -228,6 +279,9 @@ pub(super) fn vehicle_state(is_revoked: i64, epoch: i64, is_online: i64) -> Vehi
 pub(super) const RUNNING: &str = "running";
 /// State of a deployment that was refused, or whose lambda or revision has failed.
 pub(super) const FAILED: &str = "failed";
+
+/// State of a deployment that the vehicle could not fetch yet.
+pub(super) const PENDING: &str = "pending";
 
 /// Returns the error of a connection that does not count any more.
 pub(super) fn ended() -> CloudError {

@@ -7,10 +7,20 @@ use std::sync::{Arc, Mutex, PoisonError};
 use gleaner_fleet::{Wanted, desired_digest};
 
 use super::deployments::COMPLETE;
+use super::lookups::AHEAD;
 use super::vehicles::ended;
 use super::{CloudStore, StoreChange, in_list, parts, unsigned};
 use crate::error::CloudResult;
 use crate::sqlx::{self, AssertSqlSafe};
+
+/// Counts a wanted state, which is sent at once to a vehicle that is connected.
+macro_rules! next_wanted {
+    () => {
+        "generation = generation + 1, offered = CASE
+         WHEN replica IN (SELECT id FROM replicas) THEN generation + 1 ELSE offered END"
+    };
+}
+pub(super) use next_wanted;
 
 /// Maximum number of deployments of all states that are kept, some 200 bytes each.
 const CACHED_MAX: usize = 32_000;
@@ -22,6 +32,8 @@ pub(super) type TextMap = BTreeMap<String, String>;
 pub(crate) struct VehicleWants {
     pub(crate) generation: u64,
     pub(crate) deployments: Arc<[Wanted]>,
+    /// True if the vehicle is to stop and remove nothing.
+    pub(crate) keeps: bool,
 }
 
 /// The vehicles whose wanted state has changed.
@@ -73,20 +85,23 @@ impl CloudStore {
     /// Returns the state that a vehicle should have.
     pub(crate) async fn wants(&self, name: &str) -> CloudResult<VehicleWants> {
         let (generation, digest) = self.wants.find(name).await?.ok_or_else(ended)?;
-        if let Some(deployments) = self.wanted.get(&digest) {
-            return Ok(VehicleWants { generation: unsigned(generation), deployments });
+        let same = digest.strip_suffix(AHEAD);
+        let (digest, keeps) = (same.unwrap_or(&digest), same.is_some());
+        if let Some(deployments) = self.wanted.get(digest) {
+            return Ok(VehicleWants { generation: unsigned(generation), deployments, keeps });
         }
         // One transaction: the number and the deployments are of the same moment.
         let mut tx = self.pool.begin().await?;
-        let row: Option<(i64, String)> = row!(&mut *tx;
-            "SELECT generation, labels FROM vehicles WHERE name = $1 AND is_revoked = 0";
+        let row: Option<(i64, String, i64)> = row!(&mut *tx;
+            "SELECT generation, labels, is_ahead FROM vehicles WHERE name = $1 AND is_revoked = 0";
             name);
-        let (generation, labels) = row.ok_or_else(ended)?;
+        let (generation, labels, is_ahead) = row.ok_or_else(ended)?;
         let mut wishes = FleetWishes::load(&mut tx).await?;
         wishes.add_members(&mut tx, &[name]).await?;
         let deployments: Arc<[Wanted]> = wishes.of(name, &map(&labels)).into();
         self.wanted.add(desired_digest(&deployments), Arc::clone(&deployments));
-        Ok(VehicleWants { generation: unsigned(generation), deployments })
+        let (generation, keeps) = (unsigned(generation), is_ahead != 0);
+        Ok(VehicleWants { generation, deployments, keeps })
     }
 }
 
@@ -139,8 +154,8 @@ impl StoreChange<'_> {
             for part in parts(names) {
                 let (list, last) = (in_list(part.len()), part.len() + 1);
                 let sql = format!(
-                    "UPDATE vehicles SET generation = generation + 1, digest = ${last}
-                     WHERE name IN ({list})"
+                    "UPDATE vehicles SET {}, digest = ${last} WHERE name IN ({list})",
+                    next_wanted!()
                 );
                 let query = sqlx::query(AssertSqlSafe(sql));
                 let query = part.iter().fold(query, |query, name| query.bind(name));

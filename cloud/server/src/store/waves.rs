@@ -6,7 +6,7 @@ use gleaner_fleet::waves::{OnFailure, WavePlan, WaveProgress, WaveState};
 use sha2::{Digest, Sha256};
 
 use super::deployments::{COMPLETE, unknown};
-use super::vehicles::{FAILED, RUNNING};
+use super::vehicles::{FAILED, PENDING, RUNNING};
 use super::wants::{ChangedVehicles, TextMap, map, selects};
 use super::{ChangeAuthor, CloudStore, StoreChange, int, now, unsigned};
 use crate::error::{CloudError, CloudResult};
@@ -134,7 +134,10 @@ impl CloudStore {
                 continue;
             }
             let count = release.count(&mut change.tx, true).await?;
-            let step = release.next(&count, now())?;
+            let mut step = release.next(&count, now())?;
+            if let WaveStep::Pause(reason) | WaveStep::Rollback(reason) = &mut step {
+                *reason += &release.failure(&mut change.tx).await?;
+            }
             has_changed |= change.take_step(&release, step).await?;
         }
         if !has_changed {
@@ -167,8 +170,8 @@ impl CloudStore {
         }
         let (name, reason, action) = match state {
             WaveState::Running => ("running", String::new(), "resume waves"),
-            WaveState::Paused => ("paused", format!("paused by {actor}"), "pause waves"),
-            WaveState::Aborted => ("aborted", format!("aborted by {actor}"), "abort waves"),
+            WaveState::Paused => ("paused", format!("by {actor}"), "pause waves"),
+            WaveState::Aborted => ("aborted", format!("by {actor}"), "abort waves"),
         };
         if name != newest.state {
             run!(&mut *change.tx;
@@ -178,7 +181,7 @@ impl CloudStore {
         }
         // Who resumes waves has seen the failures so far; those of other vehicles count.
         if state == WaveState::Running {
-            change.forgive(id, newest.number).await?;
+            change.forgive(id, newest.number, &newest.sha256).await?;
         }
         change.finish(1, actor, action, id).await
     }
@@ -191,18 +194,13 @@ impl StoreChange<'_> {
     }
 
     /// Marks the vehicles of a release's waves that have failed so far.
-    async fn forgive(&mut self, id: &str, number: i64) -> CloudResult<()> {
+    async fn forgive(&mut self, id: &str, number: i64, envelope: &str) -> CloudResult<()> {
         run!(&mut *self.tx;
             "UPDATE wave_members SET is_forgiven = 1 WHERE deployment = $1 AND number = $2
-             AND CASE WHEN EXISTS (SELECT 1 FROM reported
-                  WHERE reported.vehicle = wave_members.vehicle
-                  AND reported.deployment = $1 AND reported.number = $2)
-             THEN EXISTS (SELECT 1 FROM reported
-                  WHERE reported.vehicle = wave_members.vehicle
-                  AND reported.deployment = $1 AND reported.number = $2 AND state = $3)
-             ELSE EXISTS (SELECT 1 FROM vehicles
-                  WHERE name = wave_members.vehicle AND handled >= generation) END";
-            id, number, FAILED);
+             AND EXISTS (SELECT 1 FROM reported
+                  WHERE reported.vehicle = wave_members.vehicle AND reported.deployment = $1
+                  AND reported.envelope = $3 AND reported.state = $4)";
+            id, number, envelope, FAILED);
         Ok(())
     }
 
@@ -236,11 +234,11 @@ impl StoreChange<'_> {
                     "UPDATE releases SET state = 'paused', since = $3, reason = $4
                      WHERE deployment = $1 AND number = $2 AND state = 'running'";
                     deployment, number, now(), &reason);
-                format!("pause release {number}: {reason}")
+                format!("pause release {number}: wave {} {reason}", release.wave)
             }
             WaveStep::Rollback(reason) => {
                 self.request_fallback(deployment, *number, &reason).await?;
-                format!("roll back release {number}: {reason}")
+                format!("roll back release {number}: wave {} {reason}", release.wave)
             }
         };
         self.note(WAVES, &action, deployment).await?;
@@ -326,18 +324,19 @@ impl Release {
         // Grouped by labels, of which there are few: SQL cannot compare them with the selector.
         let groups: Vec<(String, String, i64, i64)> = rows!(&mut **tx;
             "SELECT labels,
-             CASE WHEN reported.number = $2 THEN reported.state
-                  WHEN handled >= generation THEN 'refused'
+             CASE WHEN reported.state <> $6 THEN reported.state
                   WHEN seen < $3 THEN 'away'
                   ELSE 'late' END AS standing,
              COALESCE(is_forgiven, 0), COUNT(*)
              FROM vehicles LEFT JOIN reported
              ON reported.vehicle = vehicles.name AND reported.deployment = $1
+             AND reported.envelope = $5
              LEFT JOIN wave_members ON wave_members.vehicle = vehicles.name
              AND wave_members.deployment = $1 AND wave_members.number = $2
              WHERE is_revoked = 0 AND epoch > 0 AND ($4 = 0 OR wave_members.vehicle IS NOT NULL)
              GROUP BY 1, 2, 3";
-            &self.deployment, self.number, self.since, i64::from(only_members));
+            &self.deployment, self.number, self.since, i64::from(only_members), &self.sha256,
+            PENDING);
         let (selector, mut count) = (map(&self.selector), VehicleCount::default());
         for (labels, standing, is_forgiven, vehicles) in groups {
             let labels: TextMap = map(&labels);
@@ -346,14 +345,9 @@ impl Release {
             }
             let vehicles = unsigned(vehicles);
             count.vehicles += vehicles;
-            let has_failed = match &*standing {
-                FAILED => true,
-                // It has handled its wanted state, and has not accepted this.
-                "refused" => self.is_wanted != 0,
-                _ => false,
-            };
+            let has_failed = standing == FAILED;
             let counter = match &*standing {
-                _ if has_failed => &mut count.failed,
+                FAILED => &mut count.failed,
                 RUNNING => &mut count.running,
                 "away" => &mut count.away,
                 _ => continue,
@@ -364,6 +358,19 @@ impl Release {
             }
         }
         Ok(count)
+    }
+
+    /// Returns the first vehicle of its waves that has failed, with the reason, for an end of a
+    /// sentence; empty without one.
+    async fn failure(&self, tx: &mut Tx) -> CloudResult<String> {
+        let row: Option<(String, String)> = row!(&mut **tx;
+            "SELECT reported.vehicle, reason FROM reported JOIN wave_members
+             ON wave_members.vehicle = reported.vehicle AND wave_members.deployment = $1
+             AND wave_members.number = $2 AND is_forgiven = 0
+             WHERE reported.deployment = $1 AND envelope = $3 AND state = $4
+             ORDER BY reported.vehicle LIMIT 1";
+            &self.deployment, self.number, &self.sha256, FAILED);
+        Ok(row.map(|(vehicle, reason)| format!(" ({vehicle}: {reason})")).unwrap_or_default())
     }
 
     /// Returns the progress of its waves, unless it is open to all.
@@ -396,8 +403,7 @@ impl Release {
         let share = |part: u64, percent: u8| part * 100 > vehicles * u64::from(percent);
         let new = failed - forgiven;
         if new > 0 && share(new, plan.failures) {
-            let reason =
-                format!("wave {}: it failed on {failed} of {vehicles} vehicles", self.wave);
+            let reason = format!("failed on {failed} of {vehicles}");
             return Ok(match plan.on_failure {
                 OnFailure::Rollback if !self.fallback.is_empty() => WaveStep::Rollback(reason),
                 _ => WaveStep::Pause(reason),
@@ -420,10 +426,9 @@ impl Release {
                     false => WaveStep::Complete,
                 }
             }
-            () if !has_succeeded && open_s >= plan.deadline_s => WaveStep::Pause(format!(
-                "wave {}: {running} of {vehicles} vehicles run it at the deadline",
-                self.wave
-            )),
+            () if !has_succeeded && open_s >= plan.deadline_s => {
+                WaveStep::Pause(format!("ran on {running} of {vehicles} at its deadline"))
+            }
             () => WaveStep::Wait,
         })
     }

@@ -3,6 +3,7 @@
 
 use std::collections::HashMap;
 use std::sync::Arc;
+use std::time::Instant;
 
 use tokio::sync::{Mutex, mpsc, oneshot};
 
@@ -10,6 +11,7 @@ use super::append::AppendWrite;
 use super::links::{ConnectWrite, ReportWrite};
 use super::replicas::DisconnectWrite;
 use super::{CloudStore, StoreChange, begin, in_list, list_parts};
+use crate::counts::COUNTS;
 use crate::error::{CloudError, CloudResult};
 use crate::sqlx::{self, AnyPool, AssertSqlSafe};
 
@@ -47,13 +49,47 @@ pub(super) enum WaitingWrite {
 pub(super) type GroupVehicles = HashMap<String, GroupVehicle>;
 
 /// Values of a vehicle that its writes are checked against.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(super) struct GroupVehicle {
     pub(super) epoch: i64,
     pub(super) is_revoked: bool,
     pub(super) arrived: i64,
     pub(super) labels: String,
     pub(super) digest: String,
+    pub(super) generation: i64,
+    /// The newest wanted state that was sent to it.
+    pub(super) offered: i64,
+    pub(super) is_ahead: i64,
+    /// The boot of its machine, and the one before.
+    pub(super) boots: [String; 2],
+    /// Number of times that a former boot has come back, up to [`DOUBLE`].
+    pub(super) is_double: i64,
+}
+
+/// Number of times after which two machines have one identity: once, a failover may be the reason.
+pub(super) const DOUBLE: i64 = 2;
+
+/// The columns from which a [`GroupVehicle`] is made.
+type VehicleNumbers = (String, String, String, String, String, i64, i64, i64, i64, i64, i64, i64);
+
+impl GroupVehicle {
+    /// Notes the boot of a machine that connects; returns whether it is let in. The former boot
+    /// comes back again and again only if two machines have the identity: then the other one goes
+    /// on alone.
+    pub(super) fn admits(&mut self, boot: &str) -> bool {
+        let [newest, former] = &mut self.boots;
+        if boot.is_empty() || boot == newest {
+            return true;
+        }
+        if boot == former {
+            self.is_double = (self.is_double + 1).min(DOUBLE);
+            if self.is_double == DOUBLE {
+                return false;
+            }
+        }
+        *former = std::mem::replace(newest, boot.to_owned());
+        true
+    }
 }
 
 impl WaitingWrite {
@@ -117,7 +153,10 @@ impl GroupWriter {
     async fn run(mut self) {
         let mut group = Vec::new();
         while self.waiting.recv_many(&mut group, GROUP_MAX).await > 0 {
+            let start = Instant::now();
             let failed = self.commit(&mut group).await.is_err();
+            COUNTS.writes.add(1);
+            COUNTS.write_us.add(start.elapsed().as_micros() as u64);
             for mut write in group.drain(..) {
                 // One that the database refuses must not take the others with it.
                 let failed = match failed {
@@ -163,17 +202,25 @@ impl StoreChange<'_> {
         for part in list_parts(&names) {
             let names = in_list(part.len());
             let sql = format!(
-                "SELECT name, epoch, is_revoked, arrived, labels, digest FROM vehicles
-                 WHERE name IN ({names})"
+                "SELECT name, labels, digest, boot, former_boot, epoch, is_revoked, arrived,
+                 generation, is_ahead, is_double, offered FROM vehicles WHERE name IN ({names})"
             );
-            let query =
-                sqlx::query_as::<_, (String, i64, i64, i64, String, String)>(AssertSqlSafe(sql));
+            let query = sqlx::query_as::<_, VehicleNumbers>(AssertSqlSafe(sql));
             let query = part.iter().fold(query, |query, name| query.bind(*name));
-            for (name, epoch, is_revoked, arrived, labels, digest) in
-                query.fetch_all(&mut *self.tx).await?
-            {
-                let is_revoked = is_revoked != 0;
-                let vehicle = GroupVehicle { epoch, is_revoked, arrived, labels, digest };
+            for row in query.fetch_all(&mut *self.tx).await? {
+                let (name, labels, digest, boot, former, epoch, is_revoked, ..) = row;
+                let vehicle = GroupVehicle {
+                    epoch,
+                    is_revoked: is_revoked != 0,
+                    arrived: row.7,
+                    labels,
+                    digest,
+                    generation: row.8,
+                    is_ahead: row.9,
+                    boots: [boot, former],
+                    is_double: row.10,
+                    offered: row.11,
+                };
                 vehicles.insert(name, vehicle);
             }
         }

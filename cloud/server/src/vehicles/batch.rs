@@ -1,5 +1,7 @@
 //! Parses the records that a vehicle sends.
 
+use std::ops::Range;
+
 use gleaner_base::excerpt;
 use gleaner_fleet::{Cursor, RECORDS_MAX, Records, decompress};
 use gleaner_lambda::manifest::ItemName;
@@ -7,7 +9,7 @@ use gleaner_protocol::vehicle_api::StreamLine;
 use serde_json::json;
 
 use crate::error::{CloudError, CloudResult};
-use crate::store::{StreamBatch, name_in_lines};
+use crate::store::{NUMBER_MAX, StreamBatch, name_in_lines};
 
 /// Kinds of lines that are no records: gaps and damage.
 const MARKS: [&str; 3] = ["gap", "torn", "damaged"];
@@ -38,20 +40,13 @@ pub(super) fn parse(records: &Records) -> CloudResult<StreamBatch> {
     }
     let name = name_in_lines(stream);
     let cursor = Cursor { stream: stream.clone(), life: *life, next: *next, ..Cursor::default() };
-    let mut batch = StreamBatch { lines: Vec::new(), cursor };
+    let (mut batch, mut first) = (StreamBatch { lines: Vec::new(), cursor }, 0);
     for text in of_lines() {
         let line = serde_json::from_slice::<StreamLine>(text).map_err(|error| error.to_string());
-        // A torn end may have the number of the next record.
-        let is_before = |line: &StreamLine| is_mark(line) || line.seq < *next;
-        let line = line.and_then(|line| match line.stream == name && is_before(&line) {
-            // PostgreSQL stores no text with it.
-            true if line.boot.contains('\0') => Err("its `boot` has a zero byte".to_owned()),
-            true => Ok(line),
-            false => Err(format!("it is record {} of `{}`", line.seq, excerpt(&line.stream))),
-        });
-        // Parsed as JSON, the line is UTF-8.
+        let line = line.and_then(|line| of_stream(line, name, first..*next));
+        // Parsed as JSON, the line is UTF-8, and a carriage return is between its tokens.
         let (line, text) = match (line, std::str::from_utf8(text)) {
-            (Ok(line), Ok(text)) => (line, text.to_owned()),
+            (Ok(line), Ok(text)) => (line, text.replace('\r', " ")),
             (line, _) => damaged(name, &line.err().unwrap_or_default(), text),
         };
         let mark = match is_mark(&line) {
@@ -62,10 +57,31 @@ pub(super) fn parse(records: &Records) -> CloudResult<StreamBatch> {
             let Cursor { seq, boot, boot_ns, .. } = &mut batch.cursor;
             (*seq, *boot_ns) = (line.seq, line.boot_ns);
             boot.clone_from(&line.boot);
+            first = line.seq + 1;
         }
         batch.lines.push((line.seq, mark, text));
     }
     Ok(batch)
+}
+
+/// Returns a line if it is one of the stream with a number in `seqs`.
+fn of_stream(line: StreamLine, stream: &str, seqs: Range<u64>) -> Result<StreamLine, String> {
+    let StreamLine { seq, boot_ns, .. } = line;
+    let reason = match () {
+        // A torn end may have the number of the next record.
+        () if line.stream != stream || (!is_mark(&line) && seq >= seqs.end) => {
+            format!("it is record {seq} of `{}`", excerpt(&line.stream))
+        }
+        () if !is_mark(&line) && seq < seqs.start => {
+            format!("it is record {seq}, after record {}", seqs.start - 1)
+        }
+        () if seq > NUMBER_MAX => format!("its `seq` is {seq}, above 2^62"),
+        () if boot_ns > NUMBER_MAX => format!("its `boot_ns` is {boot_ns}, above 2^62"),
+        // PostgreSQL stores no text with it.
+        () if line.boot.contains('\0') => "its `boot` has a zero byte".to_owned(),
+        () => return Ok(line),
+    };
+    Err(reason)
 }
 
 fn is_mark(line: &StreamLine) -> bool {
@@ -112,6 +128,20 @@ mod tests {
         assert_eq!(marks, [(4, false), (5, true), (0, true), (0, true)]);
         assert!(batch.lines[2].2.contains("cannot read a line of 8 bytes"), "{:?}", batch.lines);
         assert_eq!((batch.cursor.next, batch.cursor.seq), (9, 4));
+        // Readers of events would take a carriage return for the end of a line.
+        let text = line(4, "event").replace(',', ",\r");
+        let batch =
+            parse(&Records { lines: compress(text.as_bytes()), ..records.clone() }).unwrap();
+        assert_eq!(batch.lines[0].2, line(4, "event").replace(',', ", "));
+        // Each record has a number of its own that the database can hold.
+        let late = line(5, "event").replace("\"boot_ns\":5", "\"boot_ns\":4611686018427387905");
+        let lines = [line(4, "event"), line(4, "log"), late, line(u64::MAX, "gap")].join("\n");
+        let batch =
+            parse(&Records { lines: compress(lines.as_bytes()), ..records.clone() }).unwrap();
+        assert_eq!((batch.lines.len(), batch.cursor.seq), (4, 4));
+        let reasons = ["after record 4", "its `boot_ns` is", "its `seq` is"];
+        let mut others = batch.lines[1..].iter().zip(reasons);
+        assert!(others.all(|(line, reason)| line.2.contains(reason)), "{:?}", batch.lines);
         // Lines of a lambda have its id, as on the vehicle.
         let text = line(4, "log").replace("events", "brake");
         let stream = "lambdas/brake".to_owned();

@@ -1,19 +1,21 @@
 //! The control channel of a vehicle, from its first frame to its end.
 
+use std::collections::BTreeMap;
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use axum::body::Bytes;
 use futures_util::{SinkExt, StreamExt};
-use gleaner_base::{Exit, Failure, RateLimit, visible};
+use gleaner_base::{Exit, Failure, RateLimit, excerpt};
 use gleaner_fleet::{
     Ack, Body, Desired, Frame, GoAway, Hello, PROTOCOL, Ping, Pong, Records, Reported, TAIL_S,
-    TAIL_STREAMS_MAX, Tail, Welcome, decompress,
+    TAIL_STREAMS_MAX, Tail, WantedProblem, Welcome, decompress,
 };
 use gleaner_protocol::vehicle_api::VehicleStatus;
 use hyper::upgrade::Upgraded;
 use hyper_util::rt::TokioIo;
+use serde::de::IgnoredAny;
 use tokio::sync::{SemaphorePermit, watch};
 use tokio::time::{MissedTickBehavior, interval, sleep, timeout};
 use tokio_tungstenite::WebSocketStream;
@@ -22,6 +24,7 @@ use zstd::bulk::Decompressor;
 
 use super::batch;
 use crate::cloud::Cloud;
+use crate::counts::COUNTS;
 use crate::error::{CloudError, CloudResult};
 use crate::hub::LinkOrders;
 use crate::place::blocking;
@@ -43,9 +46,11 @@ const WRITES: RateLimit = RateLimit::of(20.0, 100.0);
 /// Length of a report or of records, decompressed, that does not count among the frames that are
 /// stored at a time: many small ones are committed together.
 const SMALL: usize = 16 << 10;
-/// Number of the problems of a report that count, and of the characters of each.
+/// Number of the problems of a report that count, of the causes of each, and of the characters of
+/// each of these.
 const PROBLEMS_MAX: usize = 100;
-const PROBLEM_MAX: usize = 1000;
+const CAUSES_MAX: usize = 8;
+const PROBLEM_MAX: usize = 300;
 /// Number of labels of a vehicle, and of the bytes of a name or value.
 const LABEL_MAX: usize = 256;
 
@@ -87,6 +92,7 @@ pub(super) async fn serve(cloud: &Cloud, (name, certificate): (&str, &str), sock
         Ok(end) => end,
         Err(error) => {
             tracing::warn!(vehicle = name, reason = error.reason(), "a connection was ended");
+            COUNTS.refused_links.add(1);
             // With a database that is back soon, the vehicle should be, too, but not all at once.
             let after_ms = match error.is_internal() {
                 true => getrandom::u64().map_or(WRONG_MS, |random| random % INTERNAL_MS),
@@ -225,7 +231,8 @@ impl<'c> VehicleLink<'c> {
     async fn store_report(&mut self, reported: Reported) -> CloudResult<bool> {
         let frame = self.may_store().await;
         let most = text_max(&reported.status);
-        let mut report = parsed(most, move || report(reported)).await?;
+        let name = self.name.to_owned();
+        let mut report = parsed(most, move || report(&name, reported)).await?;
         let _frame = frame.filter(|_| report.status.len() > SMALL);
         let (before, stored) = (self.stored, StoredReport::of(&report));
         if stored.whole == before.whole {
@@ -256,8 +263,8 @@ impl<'c> VehicleLink<'c> {
             return Ok(());
         }
         self.sent = wants.generation;
-        let (generation, deployments) = (wants.generation, wants.deployments.to_vec());
-        let desired = Desired { generation, deployments };
+        let (generation, keeps) = (wants.generation, wants.keeps);
+        let desired = Desired { generation, deployments: wants.deployments.to_vec(), keeps };
         self.send(Body::Desired(desired)).await
     }
 
@@ -316,19 +323,31 @@ fn lease(tail: &VehicleTail) -> Tail {
     Tail { streams, seconds: u32::try_from(seconds).unwrap_or(TAIL_S) }
 }
 
-fn report(reported: Reported) -> CloudResult<VehicleReport> {
+fn report(name: &str, reported: Reported) -> CloudResult<VehicleReport> {
     let json = decompress(&reported.status).map_err(|error| wrong(error.to_string()))?;
     let json = String::from_utf8(json).map_err(|error| wrong(error.to_string()))?;
+    // An object, to which the age is added: it has none itself.
+    let fields = serde_json::from_str::<BTreeMap<String, IgnoredAny>>(&json);
+    let fields = fields.map_err(|error| wrong(format!("a status is none: {error}")))?;
     let status: VehicleStatus =
         serde_json::from_str(&json).map_err(|error| wrong(format!("a status is none: {error}")))?;
+    if fields.contains_key("age_s") {
+        return Err(wrong("a status has an age, which only the cloud knows"));
+    }
     let is_long = |text: &String| text.len() > LABEL_MAX;
     let mut labels = status.labels.iter();
     if labels.len() > LABEL_MAX || labels.any(|(name, value)| is_long(name) || is_long(value)) {
         return Err(wrong(format!("a vehicle has at most {LABEL_MAX} labels, each as short")));
     }
     let problems = reported.problems.iter().take(PROBLEMS_MAX);
-    let short = |problem: &String| problem.chars().take(PROBLEM_MAX).collect::<String>();
-    let problems = problems.map(|problem| visible(&short(problem))).collect();
+    let mut problems: Vec<_> = problems.map(|it| it.bounded(CAUSES_MAX, PROBLEM_MAX)).collect();
+    if status.vehicle != name {
+        problems.push(WantedProblem {
+            title: format!("it calls itself `{}`", excerpt(&status.vehicle)),
+            help: "set its name back in vehicle.toml, or enrol it under the new one".to_owned(),
+            ..WantedProblem::default()
+        });
+    }
     Ok(VehicleReport::new(reported.generation, problems, status, json))
 }
 

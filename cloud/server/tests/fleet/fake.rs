@@ -240,6 +240,7 @@ impl FakeVehicle {
             protocol: gleaner_fleet::PROTOCOL,
             version: "1.2".to_owned(),
             key: "key".to_owned(),
+            ..Hello::default()
         };
         link.send(Body::Hello(hello)).await;
         let Some(Body::Welcome(welcome)) = link.next().await else { panic!("no welcome") };

@@ -19,7 +19,10 @@ async fn a_hostile_frame_ends_its_own_connection_only() {
     };
     let status =
         |status| Frame::encoded(Body::Reported(Reported { status, ..Reported::default() }));
+    let (stream, lines) = ("events".to_owned(), compress(b""));
+    let life = Frame::encoded(Body::Records(Records { stream, life: u64::MAX, next: 1, lines }));
     let frames = [
+        (life, "`life` of stream `events` cannot be 18446744073709551615"),
         (vec![0x0a, 0xff], "a frame cannot be decoded"),
         (records("events", bomb.clone()), "it has more than 8388608 bytes"),
         (records("../events", compress(b"")), "is no stream"),

@@ -15,7 +15,7 @@ use std::path::Path;
 
 use fake::{FakeVehicle, Person, csr, soon};
 use gleaner_cloud::{CloudServer, ServeOptions};
-use gleaner_fleet::{Body, RenewRequest, Reported, compress};
+use gleaner_fleet::{Body, RenewRequest, Reported, WantedProblem, compress};
 use gleaner_trust::{Deployment, Grants, Revision, RevisionFile, SecretKey, seal, sha256};
 use http_body_util::BodyExt;
 use hyper::{Method, StatusCode};
@@ -108,7 +108,8 @@ fn reported(generation: u64) -> Body {
         "trust": null, "generation": 1, "deployments": [], "capacity": [], "supervisor": null,
     });
     let status = compress(status.to_string().as_bytes());
-    Body::Reported(Reported { generation, status, problems: vec!["no room".to_owned()] })
+    let problem = WantedProblem { title: "no room".to_owned(), ..WantedProblem::default() };
+    Body::Reported(Reported { generation, status, problems: vec![problem] })
 }
 
 #[tokio::test]
@@ -140,7 +141,7 @@ async fn a_vehicle_enrols_gets_what_is_deployed_and_is_cut_off() {
     link.settle().await;
     let summary = admin.vehicle("car-7").await;
     assert_eq!((&summary["state"], &summary["handled"]), (&json!("online"), &json!(3)));
-    assert_eq!(summary["problems"], json!(["no room"]));
+    assert_eq!(summary["problems"][0]["title"], "no room");
     let status = admin.call(Method::GET, "/v1/vehicles/car-7/status", Value::Null).await;
     assert_eq!(status["labels"]["fleet"], "test");
 

@@ -226,14 +226,14 @@ const flows = {
   async "a deployment is stopped, started, rolled back and removed"() {
     await admin.goto("/deployments");
     await admin.getByRole("link", { name: "hard-brake" }).click();
-    await button(admin, "Stop").click();
+    const changes = admin.getByRole("region", { name: "Change" });
+    await confirm(admin, changes, "Stop");
     await has(admin, "It is not wanted any more");
     // Refreshed without a reload.
     await admin.locator("figcaption", { hasText: /0\s*running/ }).waitFor();
     await button(admin, "Start").click();
     await has(admin, "It is wanted again");
     await admin.locator("figcaption", { hasText: /2\s*running/ }).waitFor();
-    const changes = admin.getByRole("region", { name: "Change" });
     await confirm(admin, changes, "Roll back");
     await has(admin, "Each vehicle runs the fallback");
     await admin.goto("/lambdas");
@@ -252,7 +252,7 @@ const flows = {
     assert.equal((await guest.goto("/access")).status(), 403);
     await has(guest, "this needs admin");
     await guest.goto("/deployments/hard-brake");
-    assert.equal(await button(guest, "Stop").count(), 0);
+    assert.equal(await guest.locator("summary", { hasText: "Stop" }).count(), 0);
     await guest.goto("/clips/brake-dark-60000000000%40car-1");
     await has(guest, "Operators can fetch it");
     assert.equal(await button(guest, "Fetch from the vehicle").count(), 0);
@@ -304,9 +304,10 @@ const flows = {
     await button(page, "Fetch from the vehicle").click();
     await has(page, "The file is wanted");
     await page.goto("/deployments/brake-dark");
-    await button(page, "Stop").click();
+    const changes = page.getByRole("region", { name: "Change" });
+    await confirm(page, changes, "Stop");
     await has(page, "It is not wanted any more");
-    await confirm(page, page.getByRole("region", { name: "Change" }), "Remove");
+    await confirm(page, changes, "Remove");
     await has(page, "The deployment is removed.");
     await button(page, "Log out").click();
     await page.waitForURL("**/login");

@@ -34,7 +34,7 @@ pub(super) struct CollectedLines {
 }
 
 /// The streams that people read as they come, until a time. It has bounds whatever a cloud sends.
-#[derive(Debug, Default)]
+#[derive(Debug, Default, Clone)]
 pub(super) struct TailLease {
     streams: BTreeSet<String>,
     until: Option<Instant>,

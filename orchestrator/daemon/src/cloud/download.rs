@@ -9,7 +9,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use futures_util::StreamExt;
-use gleaner_base::{Exit, Failure, safe_file};
+use gleaner_base::{ByteSize, Exit, Failure, safe_file};
 use gleaner_fleet::AnnouncedFile;
 use gleaner_lambda::manifest::Sha256;
 use tokio::io::AsyncWriteExt;
@@ -64,7 +64,16 @@ impl Download<'_> {
                 }
             }
         }
-        self.attempt().await.map_err(|(Broken::Off(failure) | Broken::Final(failure))| failure)
+        self.attempt().await.map_err(|broken| match broken {
+            Broken::Final(failure) => failure,
+            Broken::Off(mut failure) => {
+                let partial = self.target.with_extension("partial");
+                let here = partial.metadata().map_or(0, |file| file.len());
+                let (here, all) = (ByteSize::new(here), ByteSize::new(self.length));
+                failure.causes.push(format!("{here} of {all} are here; it goes on there"));
+                failure
+            }
+        })
     }
 
     async fn attempt(&self) -> Result<(), Broken> {

@@ -74,6 +74,7 @@ impl CloudLink {
                     self.api.cloud.set_state(LinkState::Connecting, Some(reason));
                     after + part_of(PAUSE)
                 }
+                Err(_) if settings.has_changed().unwrap_or(false) => continue,
                 Err(failure) => {
                     self.note(&failure);
                     let wait = part_of(pause);

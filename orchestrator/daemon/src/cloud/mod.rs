@@ -4,6 +4,7 @@
 //! - `http`: HTTPS to the cloud. `enrolling`: gets the first certificate, and later ones.
 //! - `link`: keeps a connection, and `session` exchanges frames over one.
 //! - `plan`: the steps from what runs to what the cloud wants; `reconcile` takes them.
+//!   `followed` remembers which state of the cloud that was.
 //! - `download`: fetches a file of a revision, and goes on where that was interrupted.
 //! - `uplink`: sends records that the cloud does not have, `resume` finds where to go on, and
 //!   `collect` decides which of them are sent at once.
@@ -20,6 +21,7 @@ mod download;
 mod enrolling;
 #[cfg(test)]
 mod fake_cloud;
+mod followed;
 mod http;
 mod link;
 mod plan;
@@ -132,6 +134,8 @@ impl Cloud {
     fn set(&self, settings: CloudSettings) -> Result<(), Failure> {
         self.file.save(&settings)?;
         self.settings.send_replace(Some(settings));
+        // A refusal was one of the former settings.
+        self.set_state(LinkState::Connecting, None);
         Ok(())
     }
 

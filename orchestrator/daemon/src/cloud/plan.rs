@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use gleaner_fleet::Wanted;
+use gleaner_fleet::{Wanted, WantedProblem};
 use gleaner_lambda::manifest::ItemName;
 
 use crate::state::{CloudWish, Deployed};
@@ -29,6 +29,22 @@ impl Step {
             Step::Deploy { id, .. } => id,
         }
     }
+
+    /// Returns whether something that runs ends by it.
+    pub(super) fn takes_away(&self) -> bool {
+        matches!(self, Step::Remove(_) | Step::Stop(..))
+    }
+
+    /// SHA-256 of the envelope that it concerns; empty for one that the cloud does not name.
+    pub(super) fn envelope(&self) -> String {
+        match self {
+            Step::Remove(_) => String::new(),
+            Step::Stop(_, wish)
+            | Step::RollBack(_, wish)
+            | Step::Start(_, wish)
+            | Step::Deploy { wish, .. } => gleaner_base::excerpt(&wish.envelope),
+        }
+    }
 }
 
 /// Returns the steps, and the reasons why parts of the wanted state are ignored.
@@ -38,11 +54,17 @@ impl Step {
 pub(super) fn plan(
     wanted: &[Wanted],
     deployed: &BTreeMap<ItemName, Deployed>,
-) -> (Vec<Step>, Vec<String>) {
+) -> (Vec<Step>, Vec<WantedProblem>) {
     let (mut steps, mut ignored, mut named) = (Vec::new(), Vec::new(), Vec::new());
     for item in wanted {
         let Ok(id) = item.id.parse::<ItemName>() else {
-            ignored.push(format!("`{}` is no id of a deployment", gleaner_base::excerpt(&item.id)));
+            let deployment = gleaner_base::excerpt(&item.id);
+            ignored.push(WantedProblem {
+                deployment: deployment.clone(),
+                envelope: gleaner_base::excerpt(&item.envelope),
+                title: format!("`{deployment}` is no id of a deployment"),
+                ..WantedProblem::default()
+            });
             continue;
         };
         let Wanted { envelope, is_wanted, rollback, start, .. } = item.clone();
@@ -107,7 +129,7 @@ mod tests {
     fn steps(wanted: &[Wanted], state: &[(&str, Option<CloudWish>)]) -> Vec<Step> {
         let state = state.iter().map(|(id, cloud)| (id.parse().unwrap(), deployed(cloud.clone())));
         let (steps, ignored) = plan(wanted, &state.collect());
-        assert_eq!(ignored, Vec::<String>::new());
+        assert_eq!(ignored, Vec::new());
         steps
     }
 
@@ -178,6 +200,7 @@ mod tests {
     #[test]
     fn an_invalid_id_is_named() {
         let (steps, ignored) = plan(&[wanted("../x", "1", true, 0)], &BTreeMap::new());
-        assert_eq!((steps, ignored), (vec![], vec!["`../x` is no id of a deployment".to_owned()]));
+        assert_eq!((steps, ignored.len()), (vec![], 1));
+        assert_eq!(ignored[0].title, "`../x` is no id of a deployment");
     }
 }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Failure, RateLimit};
-use gleaner_fleet::Desired;
+use gleaner_fleet::{Desired, WantedProblem};
 use gleaner_lambda::manifest::{ItemName, Sha256};
 use gleaner_protocol::supervision::EventKind;
 use gleaner_protocol::vehicle_api::{DeployReply, DeployRequest};
@@ -35,6 +35,8 @@ const CLOUD: &str = "the cloud";
 pub(super) struct Order {
     pub(super) desired: Desired,
     pub(super) http: CloudHttp,
+    /// SHA-256 of the certificate of the cloud's authority.
+    pub(super) authority: String,
 }
 
 /// The outcome of a wanted state.
@@ -42,7 +44,7 @@ pub(super) struct Order {
 pub(super) struct Handled {
     pub(super) generation: u64,
     /// The reasons why parts of it are not applied.
-    pub(super) problems: Vec<String>,
+    pub(super) problems: Vec<WantedProblem>,
 }
 
 /// The task that follows the wanted states.
@@ -67,7 +69,7 @@ impl Reconciler {
         let (mut pause, mut before, mut events) = (PAUSE, None, EVENTS);
         loop {
             let order = self.orders.borrow_and_update().clone();
-            let Some(Order { desired, http }) = order else {
+            let Some(Order { desired, http, authority }) = order else {
                 if self.orders.changed().await.is_err() {
                     return;
                 }
@@ -76,7 +78,7 @@ impl Reconciler {
             if before.as_ref() != Some(&desired) {
                 pause = PAUSE;
             }
-            let problems = self.follow(&desired, &http, &mut events).await;
+            let problems = self.follow(&desired, &authority, &http, &mut events).await;
             let (is_done, generation) = (problems.is_empty(), desired.generation);
             self.handled.send_replace(Handled { generation, problems });
             let desired = &*before.insert(desired);
@@ -99,12 +101,14 @@ impl Reconciler {
     async fn follow(
         &self,
         desired: &Desired,
+        authority: &str,
         http: &CloudHttp,
         events: &mut RateLimit,
-    ) -> Vec<String> {
-        let mut note = |kind, problem: &str| {
+    ) -> Vec<WantedProblem> {
+        let mut note = |kind, problem: &WantedProblem| {
             if events.take(1.0, Instant::now()) {
-                self.core.event(kind, None, problem);
+                let text = format!("`{}`: {}", problem.deployment, problem.in_words());
+                self.core.event(kind, None, &text);
             }
         };
         // A step of an earlier state, which was given up, may still end in its thread: what it
@@ -112,12 +116,23 @@ impl Reconciler {
         let ended = self.step.lock().await;
         let deployed = self.core.lock().state.deployments.clone();
         drop(ended);
-        let (steps, mut problems) = plan(&desired.deployments, &deployed);
-        problems.iter().for_each(|problem| note(EventKind::Refused, problem));
+        let (mut steps, mut problems) = plan(&desired.deployments, &deployed);
+        if desired.keeps || desired.generation < self.core.followed(authority) {
+            problems.extend(steps.extract_if(.., |step| step.takes_away()).map(kept));
+        }
+        // Before the steps, which may take hours: a cloud that is restored meanwhile is older.
+        let (name, generation) = (authority.to_owned(), desired.generation);
+        let noted = self.blocking(move |core| core.note_followed(name, generation)).await;
+        if let Err(failure) = noted {
+            problems.push(problem(String::new(), String::new(), failure));
+        }
+        for problem in &problems {
+            note(kind_of(problem), problem);
+        }
         // Files are many, and each handshake would take longer than most of them.
         let http = &http.keeping();
         for step in steps {
-            let id = step.id().clone();
+            let (id, envelope) = (step.id().clone(), step.envelope());
             let mut orders = self.orders.clone();
             // A newer state does not wait for the files of an older one.
             let taken = tokio::select! {
@@ -126,9 +141,8 @@ impl Reconciler {
             };
             if let Err(failure) = taken {
                 // One that fails blocks no other one.
-                let problem = format!("`{id}`: {failure}");
-                let is_refused = failure.exit != Exit::Unreachable;
-                note(if is_refused { EventKind::Refused } else { EventKind::Warning }, &problem);
+                let problem = problem(id.to_string(), envelope, failure);
+                note(kind_of(&problem), &problem);
                 problems.push(problem);
             }
         }
@@ -235,6 +249,36 @@ impl Reconciler {
         })
         .await;
         done.map_err(|_| Failure::new(Exit::Internal, "a step of the cloud was interrupted"))?
+    }
+}
+
+/// Returns the problem of a step that is not taken, as the cloud has lost newer states.
+fn kept(step: Step) -> WantedProblem {
+    WantedProblem {
+        deployment: step.id().to_string(),
+        envelope: step.envelope(),
+        title: "it stays here, although the cloud does not want it".to_owned(),
+        is_pending: true,
+        causes: vec!["the cloud has an older state than this vehicle has followed".to_owned()],
+        help: "after a restored backup, `gleaner vehicles agree NAME` lets the vehicle follow it"
+            .to_owned(),
+    }
+}
+
+fn kind_of(problem: &WantedProblem) -> EventKind {
+    if problem.is_pending { EventKind::Warning } else { EventKind::Refused }
+}
+
+/// Returns the problem of a step that failed.
+fn problem(deployment: String, envelope: String, failure: Failure) -> WantedProblem {
+    let Failure { exit, message, causes, help } = failure;
+    WantedProblem {
+        deployment,
+        envelope,
+        title: message,
+        is_pending: exit == Exit::Unreachable,
+        causes,
+        help: help.unwrap_or_default(),
     }
 }
 

@@ -6,11 +6,12 @@ use std::sync::mpsc as sync_mpsc;
 use std::time::Duration;
 
 use futures_util::{SinkExt, StreamExt};
-use gleaner_base::{Exit, Failure, excerpt};
+use gleaner_base::{Exit, Failure, excerpt, hex};
 use gleaner_fleet::{
-    Body, FRAME_MAX, Frame, Hello, PROTOCOL, Ping, Pong, Reported, STREAM_NAME_MAX, WANTED_MAX,
-    Welcome, compress,
+    Body, Desired, FRAME_MAX, Frame, Hello, PROTOCOL, Ping, Pong, Reported, STATUS_STREAM,
+    STREAM_NAME_MAX, WANTED_MAX, Welcome, compress,
 };
+use gleaner_spool::BootId;
 use tokio::net::TcpStream;
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
@@ -35,12 +36,15 @@ use crate::api::Api;
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);
 /// Longest time between two reports.
 const REPORT_MAX: Duration = Duration::from_secs(60);
-/// Maximum number of problems in a report, and of characters of each.
+/// Maximum number of problems in a report, of causes of each, and of characters of each of these.
 const PROBLEMS_MAX: usize = 100;
-const PROBLEM_MAX: usize = 1000;
+const CAUSES_MAX: usize = 8;
+const PROBLEM_MAX: usize = 300;
 /// Number of frames about records that wait for the thread that sends these. It has one batch of
 /// each stream on its way, so that a cloud that follows the rules does not send more.
 const UPLINK_ORDERS: usize = 4096;
+/// Largest number of a wanted state.
+const GENERATION_MAX: u64 = 1 << 60;
 /// Bounds of the interval of signs of life, in s, whatever the cloud asks for.
 const PING_S: std::ops::RangeInclusive<u32> = 5..=300;
 
@@ -72,7 +76,9 @@ impl CloudSession<'_> {
         mut settings: watch::Receiver<Option<CloudSettings>>,
     ) -> Result<SessionEnd, Failure> {
         let mut socket = self.open().await?;
-        let Welcome { ping_s, cursors, .. } = self.welcome(&mut socket).await?;
+        let authority = settings.borrow().as_ref().map(CloudSettings::authority_digest);
+        let authority = authority.unwrap_or_default();
+        let Welcome { ping_s, cursors, .. } = self.welcome(&mut socket, &authority).await?;
         self.api.cloud.set_state(LinkState::Connected, None);
         let (out, mut outgoing) = mpsc::channel(4);
         let (uplink_orders, received_orders) = sync_mpsc::sync_channel(UPLINK_ORDERS);
@@ -94,6 +100,7 @@ impl CloudSession<'_> {
         let (mut pings, mut looks) = (interval(ping), interval(STATUS_INTERVAL));
         let mut last_heard = Instant::now();
         let (mut reported, mut report_at) = (String::new(), Instant::now());
+        let mut lease = TailLease::default();
         loop {
             tokio::select! {
                 message = socket.next() => {
@@ -101,19 +108,16 @@ impl CloudSession<'_> {
                     match self.frame(message)? {
                         None => {}
                         Some(Body::Desired(desired)) => {
-                            if desired.deployments.len() > WANTED_MAX {
-                                let why = format!("it wants more than {WANTED_MAX} deployments");
-                                return Err(self.lost(&why));
-                            }
-                            generation.send_replace(desired.generation);
-                            let order = Order { desired, http: self.http.clone() };
-                            self.orders.send_replace(Some(order));
+                            let number = desired.generation;
+                            self.follow(desired, &authority)?;
+                            generation.send_replace(number);
                         }
                         Some(Body::Ack(ack)) if ack.stream.len() <= STREAM_NAME_MAX => {
                             self.order(&uplink_orders, UplinkOrder::Ack(ack))?;
                         }
                         Some(Body::Tail(tail)) => {
-                            let lease = TailLease::of(tail, Instant::now().into_std());
+                            lease = TailLease::of(tail, Instant::now().into_std());
+                            let lease = lease.clone();
                             self.order(&uplink_orders, UplinkOrder::Tail(lease))?;
                         }
                         Some(Body::Ping(Ping { number })) => {
@@ -141,7 +145,8 @@ impl CloudSession<'_> {
                 }
                 _ = looks.tick() => {
                     let (essence, body) = self.report();
-                    if essence != reported || Instant::now() >= report_at {
+                    let is_read = lease.has(STATUS_STREAM, Instant::now().into_std());
+                    if is_read || essence != reported || Instant::now() >= report_at {
                         (reported, report_at) = (essence, Instant::now() + REPORT_MAX);
                         self.send(&mut socket, body).await?;
                     }
@@ -150,6 +155,20 @@ impl CloudSession<'_> {
                 _ = settings.changed() => return Ok(SessionEnd::Changed),
             }
         }
+    }
+
+    /// Hands a wanted state to the reconciler.
+    fn follow(&self, desired: Desired, authority: &str) -> Result<(), Failure> {
+        // A number above this would lock the vehicle out of every cloud that it names later.
+        if desired.generation > GENERATION_MAX {
+            return Err(self.lost("the number of its wanted state is above 2^60"));
+        }
+        if desired.deployments.len() > WANTED_MAX {
+            return Err(self.lost(&format!("it wants more than {WANTED_MAX} deployments")));
+        }
+        let (http, authority) = (self.http.clone(), authority.to_owned());
+        self.orders.send_replace(Some(Order { desired, http, authority }));
+        Ok(())
     }
 
     /// Hands a frame to the thread that sends records, unless that has ended.
@@ -189,11 +208,13 @@ impl CloudSession<'_> {
         })
     }
 
-    async fn welcome(&self, socket: &mut Socket) -> Result<Welcome, Failure> {
+    async fn welcome(&self, socket: &mut Socket, authority: &str) -> Result<Welcome, Failure> {
         let hello = Hello {
             protocol: PROTOCOL,
             version: env!("CARGO_PKG_VERSION").to_owned(),
             key: self.api.key.to_string(),
+            followed: self.api.core.followed(authority),
+            boot: BootId::current().map(|boot| hex(&boot.0)).unwrap_or_default(),
         };
         self.send(socket, Body::Hello(hello)).await?;
         let first = timeout(PATIENCE, socket.next()).await.map_err(|late| self.broken(&late))?;
@@ -230,15 +251,15 @@ impl CloudSession<'_> {
         let status = self.api.status();
         let Handled { generation, problems } = self.handled.borrow_and_update().clone();
         let all = problems.iter().take(PROBLEMS_MAX);
-        let problems: Vec<String> = all.map(|it| it.chars().take(PROBLEM_MAX).collect()).collect();
+        let problems: Vec<_> = all.map(|it| it.bounded(CAUSES_MAX, PROBLEM_MAX)).collect();
         self.api.cloud.lock().generation = generation;
         let deployments = status.deployments.iter().map(|it| {
-            (&it.id, it.release, it.is_wanted, it.runs_fallback, it.is_proven, &it.refused)
+            (&it.id, &it.envelope, it.is_wanted, it.runs_fallback, it.is_proven, &it.refused)
         });
         let deployments: Vec<_> = deployments.collect();
         // Those that still end, too.
         let lambdas = status.supervisor.iter().flat_map(|supervisor| &supervisor.lambdas);
-        let lambdas = lambdas.map(|it| (&it.id, &it.revision, it.phase, it.restarts));
+        let lambdas = lambdas.map(|it| (&it.id, &it.revision, it.attempt, it.phase, it.pid));
         let lambdas: Vec<_> = lambdas.collect();
         let labels = &status.labels;
         let essence = format!("{generation} {problems:?} {labels:?} {deployments:?} {lambdas:?}");

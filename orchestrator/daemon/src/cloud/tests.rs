@@ -215,9 +215,10 @@ async fn a_wanted_state_that_is_not_accepted_is_refused_and_what_runs_is_left_al
     let [signed, newer] = [&first, &second].map(|it| seal(it, &[&key(PUBLISHER)]).unwrap());
     let (_session, mut channel) = vehicle.connect(Welcome::default()).await;
     let good = vehicle.offer(&deployment(5, &first), DEPLOYER, signed.clone());
-    let state = |generation, deployments| Body::Desired(Desired { generation, deployments });
+    let state =
+        |generation, deployments| Body::Desired(Desired { generation, deployments, keeps: false });
     channel.send(state(1, vec![good.clone()])).await;
-    assert_eq!(channel.reported(1).await.problems, Vec::<String>::new());
+    assert_eq!(channel.reported(1).await.problems, Vec::new());
     let runs = vehicle.runs();
     assert!(runs.contains("front"), "{runs}");
 
@@ -295,18 +296,26 @@ async fn a_wanted_state_that_is_not_accepted_is_refused_and_what_runs_is_left_al
         let deployments = if wish.id == "front" { vec![wish] } else { vec![good.clone(), wish] };
         channel.send(state(generation, deployments)).await;
         let problems = channel.reported(generation).await.problems;
-        assert!(problems.len() == 1 && problems[0].contains(expected), "{expected}: {problems:?}");
-        assert!(!problems[0].contains('\u{1b}') && problems[0].len() < 1000, "{problems:?}");
+        assert!(problems.len() == 1 && problems[0].in_words().contains(expected), "{expected}");
+        let reason = problems[0].in_words();
+        assert!(!reason.contains('\u{1b}') && reason.len() < 1000, "{reason}");
         assert_eq!(vehicle.runs(), runs, "{expected}");
         vehicle.events(expected).await;
     }
 
+    // A cloud that has lost what came since, or states that, takes nothing away.
+    for (generation, keeps) in [(1, false), (generation, true)] {
+        channel.send(Body::Desired(Desired { generation, deployments: vec![], keeps })).await;
+        let problems = channel.reported(generation).await.problems;
+        assert!(problems[0].is_pending && problems[0].title.contains("it stays here"));
+        assert_eq!(vehicle.runs(), runs);
+    }
     // What was accepted before the root expired runs on; nothing new is accepted.
     vehicle.api.core.install_root(&root(2, now() - 1)).unwrap();
     let new = by(|it| it.release = 10, DEPLOYER);
     channel.send(state(100, vec![new])).await;
     let problems = channel.reported(100).await.problems;
-    assert!(problems[0].contains("the trust root expired at"), "{problems:?}");
+    assert!(problems[0].in_words().contains("the trust root expired at"), "{problems:?}");
     assert_eq!(vehicle.runs(), runs);
     vehicle.events("the trust root expired at").await;
 }
@@ -328,7 +337,10 @@ async fn frames_that_break_the_rules_end_a_connection_with_the_reason() {
         (vec![welcome(), Message::Binary(vec![0xff; 100].into())], "a frame cannot be decoded"),
         (vec![welcome(), Message::Binary(vec![0; FRAME_MAX + 1].into())], "too long"),
         (
-            vec![welcome(), frame(Body::Desired(Desired { generation: 1, deployments: many }))],
+            vec![
+                welcome(),
+                frame(Body::Desired(Desired { generation: 1, deployments: many, keeps: false })),
+            ],
             "it wants more than 4000 deployments",
         ),
         (vec![welcome(), Message::Close(None)], "it closed the connection"),
@@ -404,11 +416,11 @@ async fn absurd_positions_and_endless_frames_change_nothing() {
     };
     for generation in 1..=500 {
         let deployments = deployments(generation);
-        channel.send(Body::Desired(Desired { generation, deployments })).await;
+        channel.send(Body::Desired(Desired { generation, deployments, keeps: false })).await;
         channel.send(Body::Ping(Ping { number: generation })).await;
     }
     let problems = channel.reported(500).await.problems;
-    assert_eq!(problems[0], "`../500/0` is no id of a deployment");
+    assert_eq!(problems[0].title, "`../500/0` is no id of a deployment");
     assert!(problems.len() < 300, "a report has bounds");
     channel.send(Body::Ping(Ping { number: 9999 })).await;
     channel.until(|body| (body == Body::Pong(Pong { number: 9999 })).then_some(())).await;

@@ -68,7 +68,8 @@ fn revision(release: u64) -> Revision {
 /// A deployment of the revision that was signed as `revision`.
 fn deployment(release: u64, revision: &[u8]) -> Deployment {
     let (root, floors, labels) = (root(), Floors::default(), Labels::new());
-    let verifier = Verifier { root: &root, floors: &floors, labels: &labels, now: SIGNED };
+    let verifier =
+        Verifier { root: &root, floors: &floors, labels: &labels, now: SIGNED, known: &[] };
     Deployment {
         id: "front".parse().unwrap(),
         release,
@@ -103,7 +104,7 @@ fn forged(payload_type: &str, payload: &[u8], seed: u8) -> Vec<u8> {
 /// Calls `check` with a vehicle that trusts [`root`] and has accepted nothing.
 fn on_vehicle<T>(check: impl FnOnce(&Verifier<'_>) -> T) -> T {
     let (root, floors, labels) = (root(), Floors::default(), Labels::new());
-    check(&Verifier { root: &root, floors: &floors, labels: &labels, now: SIGNED })
+    check(&Verifier { root: &root, floors: &floors, labels: &labels, now: SIGNED, known: &[] })
 }
 
 #[test]

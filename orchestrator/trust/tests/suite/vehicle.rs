@@ -1,6 +1,7 @@
 //! Scopes, releases that go back, expiry, clocks that jump, and new trust roots.
 
 use gleaner_base::Explain;
+use gleaner_lambda::manifest::Sha256;
 use gleaner_trust::{Deployment, Refusal, Revision, Trusted, Verdict, first_root, next_root};
 
 use super::*;
@@ -13,18 +14,19 @@ struct TestVehicle {
     floors: Floors,
     labels: Labels,
     now: u64,
+    known: Vec<Sha256>,
 }
 
 impl TestVehicle {
     fn new() -> Self {
         let mut floors = Floors::default();
         floors.accept_root(&root(), BUILT);
-        Self { root: root(), floors, labels: Labels::new(), now: SIGNED }
+        Self { root: root(), floors, labels: Labels::new(), now: SIGNED, known: Vec::new() }
     }
 
     fn verifier(&self) -> Verifier<'_> {
-        let Self { root, floors, labels, now } = self;
-        Verifier { root, floors, labels, now: *now }
+        let Self { root, floors, labels, now, known } = self;
+        Verifier { root, floors, labels, now: *now, known }
     }
 
     /// Verifies both, and accepts them.
@@ -272,9 +274,15 @@ fn a_fallback_is_older_than_its_revision_or_the_same() {
     assert_eq!(vehicle.verifier().admit(&older, &second, Some(&first)), Ok(Verdict::Current));
     vehicle.floors.accept(&older, &second, BUILT).unwrap();
     // Release 2 was accepted with another digest.
-    let wish = wish(&vehicle, 2, 2, &other);
-    let refusal = vehicle.verifier().admit(&wish, &third, Some(&other)).unwrap_err();
+    let third_with = |fallback| wish(&vehicle, 2, 2, fallback);
+    let refusal = vehicle.verifier().admit(&third_with(&other), &third, Some(&other)).unwrap_err();
     assert!(matches!(refusal, Refusal::SameRelease { .. }), "{refusal:?}");
+    // An older release comes back as a fallback only where it ran.
+    let wish = third_with(&first);
+    let refused = Err(Refusal::UnknownFallback { fallback: 1, floor: 2 });
+    assert_eq!(vehicle.verifier().admit(&wish, &third, Some(&first)), refused);
+    vehicle.known.push(first.digest().clone());
+    assert_eq!(vehicle.verifier().admit(&wish, &third, Some(&first)), Ok(Verdict::Current));
 }
 
 #[test]

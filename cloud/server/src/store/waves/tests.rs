@@ -43,7 +43,7 @@ impl TestFleet {
     /// Returns the vehicles that should have a release.
     async fn having(&self, number: u64) -> Vec<String> {
         let mut names = Vec::new();
-        let sha256 = gleaner_trust::sha256(release(number, None).envelope.as_bytes()).to_string();
+        let sha256 = envelope(number);
         for name in self.epochs.keys() {
             let wants = self.store.wants(name).await.unwrap();
             if wants.deployments.iter().any(|wanted| wanted.envelope == sha256) {
@@ -57,7 +57,7 @@ impl TestFleet {
     async fn report(&self, names: &[String], number: u64, failed: Option<&str>) {
         for name in names {
             let deployment = json!([{
-                "id": "a", "release": number, "attempt": 1, "lambda": "a",
+                "id": "a", "release": number, "envelope": envelope(number), "attempt": 1, "lambda": "a",
                 "revision": { "digest": "r", "version": "1", "release": 1 }, "fallback": null,
                 "grants": { "topics": [], "models": [], "record": false }, "is_wanted": true,
                 "runs_fallback": false, "is_proven": false, "failed": failed, "refused": null,
@@ -81,6 +81,10 @@ impl TestFleet {
         let query = sqlx::query("UPDATE releases SET since = since - $1").bind(seconds);
         query.execute(&self.store.pool).await.unwrap();
     }
+}
+
+fn envelope(number: u64) -> String {
+    gleaner_trust::sha256(release(number, None).envelope.as_bytes()).to_string()
 }
 
 fn release(number: u64, waves: Option<WavePlan>) -> OfferedDeployment {
@@ -146,7 +150,7 @@ async fn waves_stop_at_failures_until_a_person_resumes_them() {
     fleet.store.advance_waves().await.unwrap();
     let progress = fleet.progress().await;
     assert_eq!(progress.state, WaveState::Paused);
-    assert_eq!(progress.reason, "wave 1: it failed on 1 of 2 vehicles");
+    assert_eq!(progress.reason, format!("failed on 1 of 2 ({}: it faults)", first[1]));
     assert!(fleet.store.advance_waves().await.unwrap().is_empty());
     assert_eq!(fleet.having(2).await, first);
     // Who resumes them accepts the failures so far.
@@ -226,7 +230,7 @@ async fn a_wave_waits_for_its_soak_time_and_pauses_at_its_deadline() {
     fleet.store.advance_waves().await.unwrap();
     let progress = fleet.progress().await;
     assert_eq!(progress.state, WaveState::Paused);
-    assert_eq!(progress.reason, "wave 2: 1 of 2 vehicles run it at the deadline");
+    assert_eq!(progress.reason, "ran on 1 of 2 at its deadline");
 }
 
 #[tokio::test]

@@ -1,0 +1,44 @@
+//! The newest state of the cloud that the vehicle has followed: a cloud that was restored from a
+//! backup has an older one, and does not know what was deployed since.
+
+use gleaner_base::Failure;
+use gleaner_trust::sha256;
+
+use super::settings::CloudSettings;
+use crate::core::Core;
+use crate::state::{FollowedState, VehicleState};
+
+impl CloudSettings {
+    /// Returns the digest by which the vehicle remembers this cloud.
+    pub(super) fn authority_digest(&self) -> String {
+        sha256(self.authority.as_bytes()).to_string()
+    }
+}
+
+impl Core {
+    /// Returns the number of the newest state of a cloud that was followed. `authority` is the
+    /// SHA-256 of the certificate of its authority.
+    pub(crate) fn followed(&self, authority: &str) -> u64 {
+        let inner = self.lock();
+        let followed = &inner.state.followed;
+        if followed.authority == authority { followed.generation } else { 0 }
+    }
+
+    /// Remembers the newest state of a cloud that was followed.
+    ///
+    /// # Errors
+    ///
+    /// A failure if it cannot be made durable.
+    pub(crate) fn note_followed(&self, authority: String, generation: u64) -> Result<(), Failure> {
+        let mut inner = self.lock();
+        let before = &inner.state.followed;
+        if before.authority == authority && before.generation >= generation {
+            return Ok(());
+        }
+        let followed = FollowedState { authority, generation };
+        let state = VehicleState { followed, ..inner.state.clone() };
+        self.change(&mut inner, state)?;
+        self.publish(&mut inner);
+        Ok(())
+    }
+}
