@@ -8,7 +8,7 @@
 pub const LINES: &[(&str, usize, usize)] = &[
     ("base", 1198, 658),
     ("bench", 11755, 745),
-    ("cli", 11189, 4343),
+    ("cli", 11189, 4352),
     ("cloud", 19046, 6056),
     ("examples", 1318, 757),
     ("fuzz", 4216, 86),
@@ -21,8 +21,8 @@ pub const LINES: &[(&str, usize, usize)] = &[
     ("player", 2242, 793),
     ("report", 2802, 913),
     ("rules", 2707, 1191),
-    ("tests", 6532, 12163),
-    ("xtask", 7019, 622),
+    ("tests", 6532, 12170),
+    ("xtask", 7053, 622),
 ];
 
 /// Files with functions of more than 80 lines, each with its reason.

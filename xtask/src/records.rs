@@ -198,12 +198,33 @@ fn write(
         let record = Record { digest, commit, seconds, cpu_seconds, result };
         records.insert(part.name.to_owned(), record);
     }
-    let json = serde_json::to_string_pretty(&records)
+    save(checkout, &records).map(drop)
+}
+
+fn save(checkout: &Checkout, records: &PartRecords) -> Result<Exit, Failure> {
+    let json = serde_json::to_string_pretty(records)
         .map_err(|error| Failure::caused_by(Exit::Internal, "cannot write records", &error))?;
     let file = checkout.path(FILE);
     fs::write(&file, json + "\n").map_err(|error| cannot("write", &file, &error))?;
     println!("wrote {FILE}; commit it");
-    Ok(())
+    Ok(Exit::Ok)
+}
+
+/// After a change of the rule which files a part depends on, writes the digests of the parts of
+/// which no such file has changed since the commit of their records.
+fn renew(checkout: &Checkout) -> Result<Exit, Failure> {
+    let sources = CheckoutSources::read(checkout)?;
+    let mut records = read(checkout)?;
+    for part in &HEAVY {
+        let Some(record) = records.get_mut(part.name) else { continue };
+        let changed = git(checkout, &["diff", "--name-only", "--no-renames", &record.commit])?;
+        let is_used = sources.used_by(part);
+        match changed.lines().find(|path| is_used(path)) {
+            Some(path) => println!("{}: {path} has changed", part.name),
+            None => record.digest = sources.digest(checkout, part)?,
+        }
+    }
+    save(checkout, &records)
 }
 
 fn read(checkout: &Checkout) -> Result<PartRecords, Failure> {
@@ -217,9 +238,12 @@ fn read(checkout: &Checkout) -> Result<PartRecords, Failure> {
 
 /// Prints the record of a part as a row of the table of `.ci/run`, if its sources are the same as
 /// then; otherwise the exit code is [`Exit::Differs`]. With the file of its output, counts the
-/// results in that.
+/// results in that. `--renew` writes digests by a new rule.
 pub(crate) fn print(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
     let name = arguments.first().and_then(|name| name.to_str()).unwrap_or_default();
+    if name == "--renew" {
+        return renew(checkout);
+    }
     let Some(part) = HEAVY.iter().find(|part| part.name == name) else {
         return Err(Failure::new(Exit::Usage, format!("there is no heavy part `{name}`")));
     };
@@ -303,12 +327,12 @@ impl CheckoutSources {
         Ok(sources)
     }
 
-    /// The digest of all files on which a part depends.
-    fn digest(&self, checkout: &Checkout, part: &HeavyPart) -> Result<String, Failure> {
+    /// Returns which files a part depends on.
+    fn used_by<'s>(&'s self, part: &'s HeavyPart) -> impl Fn(&str) -> bool + use<'s> {
         let folders: BTreeSet<&str> = self.folders.values().map(String::as_str).collect();
         let used: BTreeSet<&str> =
             self.packages(part).iter().map(|name| self.folders[*name].as_str()).collect();
-        let is_used = |path: &str| {
+        move |path: &str| {
             let named = |name: &&str| Path::new(path).starts_with(name);
             // The innermost package that has the file.
             let package = Path::new(path).ancestors().skip(1).find_map(|folder| {
@@ -316,9 +340,19 @@ impl CheckoutSources {
                 folders.contains(folder).then_some(folder)
             });
             let is_apart = path.ends_with(".md") || HOUSE.iter().any(&named);
-            package.is_some_and(|package| used.contains(package) && !is_apart)
+            // Test programs of packages that it only links or starts are not among its programs.
+            let is_test = |package: &str| {
+                Path::new(path).starts_with(Path::new(package).join("tests"))
+                    && !part.packages.iter().any(|name| self.folders[*name] == package)
+            };
+            package.is_some_and(|it| used.contains(it) && !is_apart && !is_test(it))
                 || part.files.iter().chain(&COMMON).any(named)
-        };
+        }
+    }
+
+    /// The digest of all files on which a part depends.
+    fn digest(&self, checkout: &Checkout, part: &HeavyPart) -> Result<String, Failure> {
+        let is_used = self.used_by(part);
         let mut digest = Sha256::new();
         for path in self.files.iter().filter(|path| is_used(path)) {
             let bytes = fs::read(checkout.path(path)).map_err(|error| {

@@ -166,7 +166,13 @@ pub fn removed() {
     assert_eq!(ids(&vehicle), ["other"]);
     let old = text(&vehicle.deploy(lambda.path(), &["--release", "6"]));
     assert!(old.contains("exit status: 3") && old.contains('7'), "{old}");
-    let next = text(&vehicle.deploy(lambda.path(), &[]));
+    // What a vehicle reports decides nothing of a signature: the deployer does.
+    let unnamed = text(&vehicle.deploy(lambda.path(), &[]));
+    assert!(
+        unnamed.contains("exit status: 3") && unnamed.contains("reports release 7"),
+        "{unnamed}"
+    );
+    let next = text(&vehicle.deploy(lambda.path(), &["--release", "8"]));
     assert!(next.contains("(release 8, ") && next.contains("running"), "{next}");
 }
 

@@ -21,12 +21,21 @@ pub fn status(deployments: &[Value]) -> Value {
 #[test]
 fn vehicles_are_listed_enrolled_once_and_revoked() {
     let user = CloudUser::logged_in();
+    let key = gleaner_trust::SecretKey::generate().unwrap().public().to_string();
     let vehicles = json!([{
         "name": "car-7", "labels": {}, "state": "invited", "seen": null, "version": null,
-        "wanted": 1, "handled": 0, "problems": [{ "title": "no trust root" }], "running": 0, "deployments": 0,
+        "key": key, "wanted": 1, "handled": 0, "is_ahead": false, "is_double": true,
+        "problems": [{
+            "deployment": "brake", "envelope": "e", "title": "it is refused", "is_pending": false,
+            "causes": ["no trust root"], "help": "install one",
+        }],
+        "running": 0, "deployments": 0,
     }]);
     user.cloud.answers("GET /v1/vehicles", &[(200, json!({ "items": vehicles }))]);
-    assert!(user.done(&["vehicles"]).ends_with("car-7: no trust root\n"));
+    let text = user.done(&["vehicles"]);
+    assert!(text.contains("car-7: two machines have its identity"), "{text}");
+    assert!(text.ends_with("car-7: brake: it is refused: no trust root. install one\n"), "{text}");
+    assert_eq!(user.done(&["vehicles", "keys"]), format!("car-7 {key}\n"));
     assert_eq!(user.json(&["vehicles"]), vehicles);
     let enrolment = json!({
         "gleaner_enrolment": 1, "address": "127.0.0.1:8443", "vehicle": "car-7",
