@@ -18,6 +18,7 @@ mod test_folder;
 pub mod text;
 mod time;
 pub mod units;
+mod version;
 
 pub use atomic_write::{DiskSteps, WriteSteps, sync_folder, write_atomically, write_atomically_by};
 pub use discovery::ignored_variables;
@@ -31,3 +32,4 @@ pub use shortage::is_shortage;
 pub use text::{excerpt, grouped, hex, in_one_line, visible};
 pub use time::{UtcTime, nanoseconds};
 pub use units::{ByteSize, UnitError, format_duration, parse_duration};
+pub use version::{set_commit, version};

@@ -26,7 +26,8 @@ use gleaner_tests::root;
 
 /// Measures Gleaner against its performance goals; ends with exit code 1 if one is not met.
 #[derive(Parser)]
-#[command(name = "gleaner-bench", version, bin_name = "cargo xtask bench")]
+#[command(name = "gleaner-bench", bin_name = "cargo xtask bench")]
+#[command(version = gleaner_base::version())]
 struct Args {
     /// Fewer and shorter rounds: shows that a benchmark works; the values mean nothing.
     #[arg(long, global = true)]
@@ -102,6 +103,7 @@ enum BenchCommand {
 }
 
 fn main() -> ExitCode {
+    gleaner_base::set_commit(option_env!("GLEANER_COMMIT"));
     let args = Args::parse();
     let done = match &args.command {
         BenchCommand::Model { scale, file } => return write_model(*scale, file),

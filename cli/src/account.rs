@@ -24,7 +24,6 @@ const FILE_MAX: ByteSize = ByteSize::kib(64);
 pub(crate) const LOGIN_HELP: &str = "log in: `gleaner login URL --code CODE`; an admin of the \
     cloud makes a code with `gleaner users invite NAME --role ROLE`";
 
-/// A cloud and a token for it.
 #[derive(Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct CloudAccount {
@@ -41,7 +40,6 @@ pub(crate) struct CloudUrl {
 }
 
 impl CloudUrl {
-    /// Returns host and port, for a connection.
     pub(crate) fn address(&self) -> (&str, u16) {
         (self.host.trim_matches(['[', ']']), self.port)
     }
@@ -116,9 +114,9 @@ impl CloudAccount {
         let token = variable(TOKEN_VARIABLE);
         let url = variable(URL_VARIABLE).map(|text| text.parse::<CloudUrl>());
         let url = url.transpose().map_err(|reason| {
-            let mut failure = Failure::new(Exit::Usage, format!("cannot use {URL_VARIABLE}"));
-            failure.causes = vec![reason];
-            failure.with_help("set it to the address of the cloud, or unset it")
+            let failure = Failure::new(Exit::Usage, format!("cannot use {URL_VARIABLE}"));
+            Failure { causes: vec![reason], ..failure }
+                .with_help("set it to the address of the cloud, or unset it")
         })?;
         if let (Some(url), Some(token)) = (&url, &token) {
             return Ok(Self { url: url.clone(), token: token.clone() });
@@ -138,7 +136,6 @@ impl CloudAccount {
         }
     }
 
-    /// Loads the account in the file, if there is one.
     pub(crate) fn stored() -> Result<Option<Self>, Failure> {
         let path = file()?;
         let failed = |error: &dyn std::error::Error| {

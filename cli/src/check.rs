@@ -9,7 +9,6 @@ use crate::engines;
 use crate::replay::print_result;
 use crate::runtime;
 
-/// Runs the check and prints its report.
 pub(crate) fn run(args: &CheckArgs) -> Result<Exit, Failure> {
     if args.build_engines {
         return engines::build(&args.target.lambda, args.json);

@@ -11,13 +11,19 @@ use gleaner_protocol::ingress::IngressReport;
 use serde::de::DeserializeOwned;
 
 use crate::args::{InspectArgs, TopicsArgs};
+use crate::output::show;
 use crate::render;
 use crate::separate;
-use crate::stdout::print;
 
 /// Replaces this process by the program `name`, such as `gleaner-player`.
 pub(crate) fn replace(name: &str, arguments: &[OsString]) -> Result<Exit, Failure> {
-    let program = Parts::find()?.program(name)?;
+    let program = Parts::find()?.program(name).map_err(|error| {
+        let mut failure = Failure::from(error);
+        let package = if name == "gleaner-cloud" { name } else { "gleaner" };
+        let others = failure.help.iter().map(|help| format!("; {help}")).collect::<String>();
+        failure.help = Some(format!("install the package `{package}`, which has it{others}"));
+        failure
+    })?;
     let error = Command::new(&program).args(arguments).exec();
     Err(Failure::caused_by(Exit::Internal, format!("cannot start `{}`", program.display()), &error))
 }
@@ -27,16 +33,13 @@ pub(crate) fn topics(args: &TopicsArgs) -> Result<Exit, Failure> {
     let mut line: Vec<OsString> = vec!["topics".into()];
     line.extend(args.network.to_args());
     line.extend(args.wait.map(|wait| format!("--wait={wait}").into()));
-    let text = match report("gleaner-ingress", &line)? {
-        Err(exit) => return Ok(exit),
-        Ok(IngressReport::Topics { topics }) if args.json => render::json_line(&topics),
-        Ok(IngressReport::Topics { topics }) => render::topics(&topics),
-        Ok(_) => {
-            return Err(Failure::new(Exit::Internal, "gleaner-ingress did not report topics"));
+    match report("gleaner-ingress", &line)? {
+        Err(exit) => Ok(exit),
+        Ok(IngressReport::Topics { topics }) => {
+            show(args.json, &topics, |topics| render::topics(topics))
         }
-    };
-    print(&text)?;
-    Ok(Exit::Ok)
+        Ok(_) => Err(Failure::new(Exit::Internal, "gleaner-ingress did not report topics")),
+    }
 }
 
 /// Prints the contents of a drive, which `gleaner-runtime` reads.
@@ -58,7 +61,7 @@ pub(crate) fn inspect(args: &InspectArgs) -> Result<Exit, Failure> {
             return Err(Failure::new(Exit::Internal, "gleaner-runtime did not report a drive"));
         }
     };
-    print(&if args.json { render::json_line(&drive) } else { render::drive(&drive) })?;
+    show(args.json, &drive, render::drive)?;
     Ok(if drive.damaged.is_some() { Exit::DriveDamaged } else { Exit::Ok })
 }
 

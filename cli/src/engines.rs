@@ -3,7 +3,6 @@
 //!
 //! A process of its own builds each: a hostile model can spoil no engine but its own.
 
-use std::io::{self, Write};
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -21,9 +20,8 @@ use gleaner_protocol::inference::{
 use gleaner_supervisor::{InferenceEvent, InferenceService};
 use serde::Serialize;
 
-use crate::render;
+use crate::output::{print, print_error, print_json};
 use crate::run::stop_flag;
-use crate::stdout::print;
 
 /// Provider that has engines.
 const TENSORRT: &str = "tensorrt";
@@ -37,10 +35,8 @@ const BUILD_MEMORY: ByteSize = ByteSize::gib(8);
 /// The way out for a model whose engine cannot be made or used.
 const SMALLER: &str = "use a smaller model, or leave `tensorrt` out of its `providers`";
 
-/// Interval of lines about a build in progress.
 const PROGRESS_INTERVAL: Duration = Duration::from_secs(5);
 
-/// Interval of looks at the signals.
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
 
 #[derive(Debug, Serialize)]
@@ -80,7 +76,7 @@ pub(crate) fn build(lambda: &Path, is_json: bool) -> Result<Exit, Failure> {
             Ok(engine) => engine,
             Err(failure) => {
                 if is_json {
-                    print(&render::json_line(&results))?;
+                    print_json(&results)?;
                 }
                 return Err(failure);
             }
@@ -93,7 +89,7 @@ pub(crate) fn build(lambda: &Path, is_json: bool) -> Result<Exit, Failure> {
         results.push(result);
     }
     if is_json {
-        print(&render::json_line(&results))?;
+        print_json(&results)?;
     } else if results.is_empty() {
         print("the lambda has no models: there is nothing to build\n")?;
     }
@@ -186,7 +182,7 @@ impl EngineBuild<'_> {
                 Ok(InferenceEvent::Ended(reason, _)) => {
                     return Err(self.failed(visible(&reason)).with_help(SMALLER));
                 }
-                Ok(InferenceEvent::Stderr(text)) => drop(io::stderr().write_all(&text)),
+                Ok(InferenceEvent::Stderr(text)) => print_error(&String::from_utf8_lossy(&text)),
                 Ok(InferenceEvent::Warning(text)) => self.show(&text),
                 Ok(InferenceEvent::Report(_)) | Err(RecvTimeoutError::Timeout) => {}
                 Err(RecvTimeoutError::Disconnected) => {
@@ -204,8 +200,7 @@ impl EngineBuild<'_> {
     }
 
     fn show(&self, text: &str) {
-        // A reader that has ended does not end the build.
-        let _ = writeln!(io::stderr(), "model `{}`: {}", self.model.file, visible(text));
+        print_error(&format!("model `{}`: {}\n", self.model.file, visible(text)));
     }
 
     fn failed(&self, cause: impl Into<String>) -> Failure {

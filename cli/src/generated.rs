@@ -7,9 +7,8 @@ use clap_complete::Shell;
 use gleaner_base::{Exit, Failure};
 
 use crate::args::Cli;
-use crate::stdout::print;
+use crate::output::print;
 
-/// Prints the completion script of a shell.
 pub(crate) fn completions(shell: Shell) -> Result<Exit, Failure> {
     let mut script = Vec::new();
     clap_complete::generate(shell, &mut Cli::command(), "gleaner", &mut script);
@@ -17,7 +16,6 @@ pub(crate) fn completions(shell: Shell) -> Result<Exit, Failure> {
     Ok(Exit::Ok)
 }
 
-/// Writes a man page for each command into `folder`.
 pub(crate) fn man(folder: &Path) -> Result<Exit, Failure> {
     let written = std::fs::create_dir_all(folder)
         .and_then(|()| clap_mangen::generate_to(Cli::command(), folder));

@@ -24,6 +24,7 @@ mod doctor;
 mod engines;
 mod generated;
 mod new;
+mod output;
 mod pipe_reader;
 mod render;
 mod replay;
@@ -32,8 +33,12 @@ mod run;
 mod runtime;
 mod separate;
 mod signing;
-mod stdout;
 mod vehicle;
+
+use std::fs;
+use std::io;
+use std::path::Path;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use gleaner_base::{Exit, Failure};
 
@@ -80,5 +85,18 @@ pub fn run(cli: Cli) -> Result<Exit, Failure> {
         CliCommand::Doctor(args) => doctor::run(&args),
         CliCommand::Completions { shell } => generated::completions(shell),
         CliCommand::Man { folder } => generated::man(&folder),
+    }
+}
+
+/// Returns the time since 1970; a clock before that counts as 1970.
+fn since_1970() -> Duration {
+    SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default()
+}
+
+/// Removes a folder, if it exists.
+fn remove_folder(folder: &Path) -> io::Result<()> {
+    match fs::remove_dir_all(folder) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
+        _ => Ok(()),
     }
 }

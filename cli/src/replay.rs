@@ -11,13 +11,13 @@ use gleaner_protocol::ReplaySummary;
 use gleaner_report::{Decisions, clips};
 use serde_json::Value;
 
-use crate::args::{ReplayArgs, VerifyArgs};
+use crate::args::{ReplayArgs, ReplayedArgs, VerifyArgs};
+use crate::output::{print, print_error, print_json, show};
 use crate::render::{self, Digest, Paint};
 use crate::report;
 use crate::runtime::{self, RuntimeResult};
 use crate::separate;
 use crate::signing;
-use crate::stdout::print;
 
 /// Replays; returns the exit code of the runtime.
 pub(crate) fn run(args: &ReplayArgs) -> Result<Exit, Failure> {
@@ -27,15 +27,16 @@ pub(crate) fn run(args: &ReplayArgs) -> Result<Exit, Failure> {
 /// Replays. Returns the exit code of the runtime, and the folders of new results: a lambda that
 /// cannot start leaves the earlier ones.
 pub(crate) fn results(args: &ReplayArgs) -> Result<(Exit, Vec<PathBuf>), Failure> {
+    let target = &args.replayed.target;
     let (mut result, exit) =
-        runtime::run(&args.target.lambda, args.target.vehicle.as_deref(), arguments(args))?;
+        runtime::run(&target.lambda, target.vehicle.as_deref(), arguments(args))?;
     if let Some(RuntimeResult::Separate(drives)) = &result {
         return each(args, drives);
     }
-    let folders = result.iter().map(|_| out_of(args)).collect();
+    let folders = result.iter().map(|_| args.replayed.out()).collect();
     if let Some(RuntimeResult::Summary(summary)) = &mut result {
         // Not the path in the report, which may come from the lambda's process.
-        summary.out = out_of(args);
+        summary.out = args.replayed.out();
     }
     let report = match &result {
         Some(RuntimeResult::Summary(summary)) => report_of(&summary.out, args.no_report),
@@ -59,23 +60,21 @@ pub(crate) fn results(args: &ReplayArgs) -> Result<(Exit, Vec<PathBuf>), Failure
     Ok((exit, folders))
 }
 
-fn out_of(args: &ReplayArgs) -> PathBuf {
-    args.out.clone().unwrap_or_else(|| args.target.lambda.join("out"))
-}
-
 /// Replays separate drives one by one, each with a fresh lambda.
 fn each(args: &ReplayArgs, drives: &[Vec<PathBuf>]) -> Result<(Exit, Vec<PathBuf>), Failure> {
-    let out = out_of(args);
+    let out = args.replayed.out();
     let folder = separate::folder(&out);
-    safe_file::refuse_linked(&folder, &args.target.lambda)?;
+    safe_file::refuse_linked(&folder, &args.replayed.target.lambda)?;
     let _held = OutputLock::take(&folder)?;
     if out.join("summary.json").exists() {
-        eprintln!("note: the results of an earlier replay stay in `{}`", visible_path(&out));
+        let out = visible_path(&out);
+        print_error(&format!("note: the results of an earlier replay stay in `{out}`\n"));
     }
     let mut replayed = Vec::new();
     let exit = separate::each(drives, args.json, |drives, name| {
         let out = Some(folder.join(name));
-        let (exit, folders) = results(&ReplayArgs { drives, out, ..args.clone() })?;
+        let one = ReplayedArgs { drives, out, ..args.replayed.clone() };
+        let (exit, folders) = results(&ReplayArgs { replayed: one, ..args.clone() })?;
         replayed.extend(folders);
         Ok(exit)
     })?;
@@ -121,9 +120,11 @@ pub(crate) fn verify(args: &VerifyArgs) -> Result<Exit, Failure> {
         }
     };
     match (&signed, &result) {
-        (Some(signed), None) if args.json => print(&signing::clip_json(signed, Value::Null))?,
+        (Some(signed), None) if args.json => {
+            print_json(&signing::clip_json(signed, Value::Null))?;
+        }
         (Some(signed), Some(RuntimeResult::Verified(verified))) if args.json => {
-            print(&signing::clip_json(signed, serde_json::json!(verified)))?;
+            print_json(&signing::clip_json(signed, serde_json::json!(verified)))?;
         }
         _ => return print_result((result, exit), args.json),
     }
@@ -135,18 +136,21 @@ pub(crate) fn print_result(
     (result, exit): (Option<RuntimeResult>, Exit),
     json: bool,
 ) -> Result<Exit, Failure> {
-    let text = match result {
-        None => return Ok(exit),
-        Some(RuntimeResult::Summary(summary)) if json => render::json_line(&summary),
-        Some(RuntimeResult::Verified(verified)) if json => render::json_line(&verified),
-        Some(RuntimeResult::Checked(checked)) if json => render::json_line(&checked),
-        Some(RuntimeResult::Checked(checked)) => render::check_report(&checked, Paint::of_stdout()),
-        Some(RuntimeResult::Summary(summary)) => summary_text(&summary)?,
-        // Only a replay reports it, which takes them one by one.
-        Some(RuntimeResult::Separate(_)) => return Ok(exit),
-        Some(RuntimeResult::Verified(verified)) => render::verified(&verified, Paint::of_stdout()),
-    };
-    print(&text)?;
+    let paint = Paint::of_stdout();
+    match result {
+        Some(RuntimeResult::Summary(summary)) if json => {
+            print_json(&summary)?;
+        }
+        Some(RuntimeResult::Summary(summary)) => print(&summary_text(&summary)?)?,
+        Some(RuntimeResult::Checked(checked)) => {
+            show(json, &checked, |checked| render::check_report(checked, paint))?;
+        }
+        Some(RuntimeResult::Verified(verified)) => {
+            show(json, &verified, |verified| render::verified(verified, paint))?;
+        }
+        // Only a replay reports several drives, which takes them one by one.
+        Some(RuntimeResult::Separate(_)) | None => {}
+    }
     Ok(exit)
 }
 
@@ -158,31 +162,26 @@ fn summary_text(summary: &ReplaySummary) -> Result<String, Failure> {
 
 /// Returns the arguments of the runtime: those of the command, except the ones about output.
 fn arguments(args: &ReplayArgs) -> Vec<OsString> {
+    let ReplayedArgs { target, drives, merge, from, to, out, no_record } = &args.replayed;
     let mut line: Vec<OsString> = vec!["replay".into()];
-    line.extend(args.target.settings());
-    for (flag, file) in
-        [("--out", &args.out), ("--journal", &args.journal), ("--verify", &args.verify)]
-    {
+    line.extend(target.settings());
+    for (flag, file) in [("--out", out), ("--journal", &args.journal), ("--verify", &args.verify)] {
         if let Some(file) = file {
             line.extend([flag.into(), file.into()]);
         }
     }
-    for (flag, time) in [("--from", &args.from), ("--to", &args.to)] {
+    for (flag, time) in [("--from", from), ("--to", to)] {
         line.extend(time.iter().flat_map(|time| [OsString::from(flag), time.into()]));
     }
     line.extend(
         args.topics.iter().flat_map(|pattern| [OsString::from("--topics"), pattern.into()]),
     );
-    for (flag, wanted) in
-        [("--merge", args.merge), ("--all", args.all), ("--no-record", args.no_record)]
-    {
-        if wanted {
-            line.push(flag.into());
-        }
+    for (flag, wanted) in [("--merge", *merge), ("--all", args.all), ("--no-record", *no_record)] {
+        line.extend(wanted.then(|| flag.into()));
     }
     line.push("--".into());
-    line.push(args.target.lambda.clone().into());
-    line.extend(args.drives.iter().map(|drive| drive.clone().into()));
+    line.push(target.lambda.clone().into());
+    line.extend(drives.iter().map(|drive| drive.clone().into()));
     line
 }
 
@@ -193,20 +192,24 @@ mod tests {
 
     #[test]
     fn the_runtime_gets_the_arguments_with_the_files_last() {
-        let args = ReplayArgs {
-            target: LambdaArgs {
-                lambda: "-dir".into(),
-                set: vec!["x=-1".to_owned()],
-                remap: vec!["/a:=/b".to_owned()],
-                vehicle: Some("v.toml".into()),
-            },
+        let target = LambdaArgs {
+            lambda: "-dir".into(),
+            set: vec!["x=-1".to_owned()],
+            remap: vec!["/a:=/b".to_owned()],
+            vehicle: Some("v.toml".into()),
+        };
+        let replayed = ReplayedArgs {
+            target,
             drives: vec!["a.mcap".into(), "b".into()],
             from: Some("12.5".to_owned()),
             to: Some("@7".to_owned()),
             merge: true,
             out: Some("out".into()),
-            all: true,
             no_record: true,
+        };
+        let args = ReplayArgs {
+            replayed,
+            all: true,
             topics: vec!["*".to_owned(), "/a".to_owned()],
             journal: Some("j".into()),
             verify: None,

@@ -7,13 +7,12 @@ use gleaner_base::{Exit, Failure, visible, write_atomically};
 use gleaner_report::{Diff, ReportPage};
 
 use crate::args::ReportArgs;
+use crate::output::print;
 use crate::separate;
-use crate::stdout::print;
 
 /// File name of the page in the result folder.
 pub(crate) const NAME: &str = "report.html";
 
-/// Runs `gleaner report OUT`.
 pub(crate) fn run(args: &ReportArgs) -> Result<Exit, Failure> {
     let mut folders = separate::result_folders(&args.out);
     if folders.is_empty() {

@@ -1,9 +1,10 @@
 //! Runs `gleaner-runtime`: shows its progress and messages, and reads its result.
 
 use std::ffi::OsString;
-use std::io::{self, BufReader, Read, Write};
+use std::io::{self, BufReader, Read};
 use std::os::fd::OwnedFd;
 use std::os::unix::net::UnixStream;
+use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::Arc;
@@ -18,6 +19,7 @@ use gleaner_supervisor::lines::{next_report, pass_on};
 use gleaner_supervisor::{InferenceEvent, InferenceService, starter};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
+use crate::output::print_error;
 use crate::pipe_reader::PipeReader;
 use crate::render::{self, Paint};
 
@@ -38,25 +40,22 @@ enum RuntimeError {
 
 impl Explain for RuntimeError {
     fn help(&self) -> Option<String> {
-        match self {
+        let help = match self {
             RuntimeError::Report { .. } => {
-                Some("install the same version of gleaner and gleaner-runtime".to_owned())
+                "install the same version of gleaner and gleaner-runtime"
             }
             RuntimeError::NoResult { status } | RuntimeError::Code { status }
-                if signal_of(*status) == Some(9) =>
+                if status.signal() == Some(9) =>
             {
-                Some(
-                    "the system kills the largest process when memory runs out; see `dmesg`"
-                        .to_owned(),
-                )
+                "the system kills the largest process when memory runs out; see `dmesg`"
             }
-            RuntimeError::NoResult { .. } | RuntimeError::Code { .. } => Some(
+            RuntimeError::NoResult { .. } | RuntimeError::Code { .. } => {
                 "code of a lambda cannot end this process: run again with GLEANER_LOG=debug, and \
                  report the output"
-                    .to_owned(),
-            ),
-            RuntimeError::Start { .. } | RuntimeError::Read { .. } => None,
-        }
+            }
+            RuntimeError::Start { .. } | RuntimeError::Read { .. } => return None,
+        };
+        Some(help.to_owned())
     }
 }
 
@@ -98,8 +97,8 @@ pub(crate) fn run(
     let explained = Arc::new(AtomicBool::new(false));
     let errors = child.stderr.take().map(|stderr| {
         let (bar, explained) = (bar.clone(), explained.clone());
-        // Messages are printed above the bar. An error of standard error itself cannot be reported.
-        let show = move |piece: &[u8]| drop(bar.suspend(|| io::stderr().write_all(piece)));
+        // Messages are printed above the bar.
+        let show = move |piece: &[u8]| bar.suspend(|| print_error(&String::from_utf8_lossy(piece)));
         PipeReader::start(move || pass_on(stderr, &explained, show))
     });
     let reports = child.stdout.take().map(|reports| {
@@ -155,7 +154,7 @@ impl ModelsOfRun {
                 failed.store(true, Ordering::Relaxed);
             }
             let text = render::inference_event(&event, Paint::of_stderr());
-            bar.suspend(|| drop(io::stderr().write_all(&text)));
+            bar.suspend(|| print_error(&text));
         })?;
         let inference = service.add(manifest.lambda.name.as_str(), build, manifest)?;
         let cannot = |error: &dyn std::error::Error| {
@@ -240,16 +239,6 @@ fn progress_bar() -> ProgressBar {
     bar.with_style(
         ProgressStyle::with_template(style).unwrap_or_else(|_| ProgressStyle::default_bar()),
     )
-}
-
-#[cfg(unix)]
-fn signal_of(status: ExitStatus) -> Option<i32> {
-    std::os::unix::process::ExitStatusExt::signal(&status)
-}
-
-#[cfg(not(unix))]
-fn signal_of(_: ExitStatus) -> Option<i32> {
-    None
 }
 
 #[cfg(test)]

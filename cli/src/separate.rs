@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use gleaner_base::{Exit, Failure, visible};
 
-use crate::stdout::print;
+use crate::output::{print, print_error};
 
 /// Folder below the results of a replay with those of separate drives.
 const DRIVES: &str = "drives";
@@ -30,14 +30,13 @@ pub(crate) fn each(
         let has_results = matches!(exit, Exit::Ok | Exit::LambdaFaulted | Exit::DriveDamaged);
         let left = drives.len() - n - 1;
         if !has_results && left > 0 {
-            eprintln!("note: {left} of {} drives were left out", drives.len());
+            print_error(&format!("note: {left} of {} drives were left out\n", drives.len()));
             return Ok(exit);
         }
     }
     Ok(first)
 }
 
-/// Returns the folder of the results of separate drives in `out`.
 pub(crate) fn folder(out: &Path) -> PathBuf {
     out.join(DRIVES)
 }

@@ -3,7 +3,6 @@
 
 use std::path::Path;
 use std::sync::Arc;
-use std::time::{SystemTime, UNIX_EPOCH};
 
 use gleaner_base::{Exit, Explain, Failure, UtcTime, safe_file, visible};
 use gleaner_report::format::{counted, size};
@@ -15,8 +14,9 @@ use gleaner_trust::{
 use serde_json::{Value, json};
 
 use crate::args::{KeysArgs, KeysCommand, PublishArgs, SignArgs};
-use crate::render::{Paint, json_line};
-use crate::stdout::print;
+use crate::output;
+use crate::render::Paint;
+use crate::since_1970;
 
 pub(crate) fn keys(command: &KeysCommand) -> Result<Exit, Failure> {
     match command {
@@ -31,24 +31,21 @@ pub(crate) fn keys(command: &KeysCommand) -> Result<Exit, Failure> {
 
 fn show(args: &KeysArgs, key: &PublicKey, done: &str) -> Result<Exit, Failure> {
     let (file, id) = (args.file.display(), key.id());
-    print(&if args.json {
-        json_line(&json!({ "file": file.to_string(), "public": key, "id": id }))
-    } else {
+    let shown = json!({ "file": file.to_string(), "public": key, "id": id });
+    output::show(args.json, &shown, |_| {
         format!("{done}{file}\n  public key: {key}\n  key id:     {id}\n")
-    })?;
-    Ok(Exit::Ok)
+    })
 }
 
 pub(crate) fn publish(args: &PublishArgs) -> Result<Exit, Failure> {
     let key = SecretKey::load(&args.key)?;
     let out = args.out.clone().unwrap_or_else(|| args.lambda.join("revision.json"));
-    // A clock before 1970 counts as 1970; no vehicle compares this time.
-    let created = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs();
+    // No vehicle compares this time.
+    let created = since_1970().as_secs();
     let release = Release { lambda: &args.lambda, out: &out, release: args.release, created };
     let published = gleaner_trust::publish(&release, &key)?;
-    let shown = if args.json { json_of } else { text_of };
-    print(&shown(&published, &key.public(), &out))?;
-    Ok(Exit::Ok)
+    let shown = json_of(&published, &key.public(), &out);
+    output::show(args.json, &shown, |_| text_of(&published, &out))
 }
 
 /// Returns how the clips of a run are signed. The key is checked before anything is started.
@@ -58,9 +55,9 @@ pub(crate) fn of_clips(args: &SignArgs) -> Result<Option<ClipSigning>, Failure> 
     let vehicle = match &args.vehicle_name {
         Some(name) => name.clone(),
         None => VehicleName::of_machine().map_err(|reason| {
-            let mut failure = Failure::new(Exit::Usage, "this machine has no name for signatures");
-            failure.causes = vec![reason];
-            failure.with_help("name the vehicle: --vehicle-name NAME")
+            let failure = Failure::new(Exit::Usage, "this machine has no name for signatures");
+            Failure { causes: vec![reason], ..failure }
+                .with_help("name the vehicle: --vehicle-name NAME")
         })?,
     };
     Ok(Some(ClipSigning { key: Arc::new(key), vehicle: vehicle.to_string() }))
@@ -78,7 +75,6 @@ pub(crate) fn check_clip(clip: &Path, trust: &Path) -> Result<SignedClip, Failur
     })
 }
 
-/// Returns the line about a signed clip.
 pub(crate) fn clip_text(signed: &SignedClip, paint: Paint) -> String {
     let SignedClip { statement, key } = signed;
     let lambda = |lambda: &SignedLambda| format!("{} {}", lambda.name, lambda.version);
@@ -92,20 +88,16 @@ pub(crate) fn clip_text(signed: &SignedClip, paint: Paint) -> String {
 }
 
 /// Returns the JSON object about a signed clip, with the members of `more`.
-pub(crate) fn clip_json(signed: &SignedClip, more: Value) -> String {
+pub(crate) fn clip_json(signed: &SignedClip, more: Value) -> Value {
     let SignedClip { statement, key } = signed;
     let mut object = json!({ "signature": { "key": key, "statement": statement } });
     if let (Value::Object(object), Value::Object(more)) = (&mut object, more) {
         object.extend(more);
     }
-    json_line(&object)
+    object
 }
 
-fn text_of(
-    Published { revision, digest, unchanged }: &Published,
-    _: &PublicKey,
-    out: &Path,
-) -> String {
+fn text_of(Published { revision, digest, unchanged }: &Published, out: &Path) -> String {
     let files = counted(revision.files.len() as u64, "file");
     format!(
         "{} {} ({} {}, release {}, {files}, {})\n  revision: {digest}\n",
@@ -122,8 +114,8 @@ fn json_of(
     Published { revision, digest, unchanged }: &Published,
     key: &PublicKey,
     out: &Path,
-) -> String {
-    json_line(&json!({
+) -> Value {
+    json!({
         "lambda": revision.name,
         "version": revision.version,
         "release": revision.release,
@@ -133,5 +125,5 @@ fn json_of(
         "files": revision.files.len(),
         "bytes": revision.files.iter().map(|file| file.bytes).sum::<u64>(),
         "unchanged": unchanged,
-    }))
+    })
 }

@@ -16,11 +16,11 @@ use crate::budget;
 const LIMITS: DriveLimits =
     DriveLimits { chunk_bytes: 256 << 10, open_bytes: 512 << 10, unpacked_bytes: 1 << 20 };
 
-/// LastSample budget of a replay: the open chunks, the chunk that is being opened, and the channel
+/// Memory budget of a replay: the open chunks, the chunk that is being opened, and the channel
 /// records of the file.
 pub(crate) const MEMORY: usize = 16 << 20;
 
-/// LastSample budget of metadata and attachments, overhead included.
+/// Memory budget of metadata and attachments, overhead included.
 const EXTRAS: u64 = 32 << 10;
 
 /// More steps than the limits on chunks and files allow for a valid drive; a replay that exceeds
@@ -156,7 +156,6 @@ impl OrderCheck {
     }
 }
 
-/// Keeps the newest sample.
 #[derive(Default)]
 struct LastSample {
     meta: Mutex<(Option<SampleMeta>, u64)>,

@@ -5,7 +5,7 @@
 //! are read, and the path.
 
 use std::collections::VecDeque;
-use std::sync::OnceLock;
+use std::sync::{Arc, OnceLock};
 
 use gleaner_messages::{
     CdrError, CompressedView, Definitions, Endian, FieldPath, ImageView, MessageValue, PathError,
@@ -77,15 +77,15 @@ pub fn check(data: &[u8]) -> bool {
     valid
 }
 
+pub(crate) fn bundled_text(name: &str) -> Arc<str> {
+    Sources::default().find(name).expect("bundled types are complete").expect("the type is bundled")
+}
+
 fn bundled() -> &'static [(Definitions, Vec<FieldPath>)] {
     static BUNDLED: OnceLock<Vec<(Definitions, Vec<FieldPath>)>> = OnceLock::new();
     BUNDLED.get_or_init(|| {
         let definitions = TYPES.map(|name| {
-            let text = Sources::default()
-                .find(name)
-                .expect("bundled types are complete")
-                .expect("the type is bundled");
-            Definitions::parse(name, &text).expect("a bundled type parses")
+            Definitions::parse(name, &bundled_text(name)).expect("a bundled type parses")
         });
         definitions
             .into_iter()

@@ -4,5 +4,6 @@
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
+    gleaner_base::set_commit(option_env!("GLEANER_COMMIT"));
     gleaner_host::program::main()
 }

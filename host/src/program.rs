@@ -36,7 +36,7 @@ use crate::session_setup::{ConfiguredLambda, Load, RunMode};
 
 /// Hosts one lambda. Writes reports, a JSON object a line, to standard output.
 #[derive(Parser)]
-#[command(name = "gleaner-runtime", version)]
+#[command(name = "gleaner-runtime", version = gleaner_base::version())]
 struct Cli {
     /// Runs the lambda of a replay, sends each outcome to the process that started this one, and
     /// writes nothing.
@@ -184,6 +184,7 @@ fn at_start(manifest: &Manifest, is_live: bool) -> u64 {
 
 impl Cli {
     /// Returns the job, or the exit of a command that needs no lambda.
+    /// Returns the job, or the exit of a command that needs no lambda.
     fn job(self) -> Result<Result<RuntimeJob, Exit>, Failure> {
         let Self { unpacked, command, .. } = self;
         let mut job = command.job()?;
@@ -195,7 +196,6 @@ impl Cli {
 }
 
 impl RuntimeCommand {
-    /// Returns the job, or the exit of a command that needs no lambda.
     fn job(self) -> Result<Result<RuntimeJob, Exit>, Failure> {
         Ok(match self {
             Self::Replay(args) => Ok(RuntimeJob::Replay(replay::ReplayJob::replay(args)?)),

@@ -4,7 +4,6 @@
 /// Maximum length of a number, in bytes.
 pub(super) const NUMBER_MAX: usize = 10;
 
-/// Appends `number`.
 pub(super) fn put(mut number: u64, out: &mut Vec<u8>) {
     while number >= 0x80 {
         out.push(number as u8 | 0x80);

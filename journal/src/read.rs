@@ -206,7 +206,6 @@ impl<R: Read> JournalReader<R> {
     }
 }
 
-/// The reason why reading stops.
 enum ReadStop {
     Damage(Damage),
     Read(io::Error),

@@ -133,7 +133,6 @@ impl<W: Write> JournalWriter<W> {
         Ok(self.out)
     }
 
-    /// Returns the output so far.
     #[cfg(test)]
     pub(super) fn written(&self) -> &W {
         &self.out

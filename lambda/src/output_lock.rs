@@ -5,8 +5,8 @@ use std::fs::{self, File, TryLockError};
 use std::io;
 use std::path::{Path, PathBuf};
 
+use gleaner_base::Explain;
 use gleaner_base::safe_file::{self, UnsafePath};
-use gleaner_base::{Exit, Explain};
 
 /// Name of the file that is locked.
 pub(crate) const LOCK: &str = ".lock";
@@ -67,9 +67,5 @@ impl Explain for OutputLockError {
             }
             Self::Lock { .. } => "choose a folder that you may write to: --out DIR".to_owned(),
         })
-    }
-
-    fn exit(&self) -> Exit {
-        Exit::Internal
     }
 }

@@ -18,7 +18,8 @@ use crate::stamp::StampMode;
 /// a drive from a vehicle. The DDS domain is --domain, else ROS_DOMAIN_ID, else 0. Ctrl-C stops
 /// playing and prints the summary.
 #[derive(Parser, Debug)]
-#[command(name = "gleaner-player", bin_name = "gleaner play", version)]
+#[command(name = "gleaner-player", bin_name = "gleaner play")]
+#[command(version = gleaner_base::version())]
 #[command(group = ArgGroup::new("what")
     .required(true)
     .multiple(true)
@@ -136,7 +137,6 @@ impl FromStr for Size {
     }
 }
 
-/// A synthetic camera.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub(crate) struct SyntheticCamera {
     pub(crate) size: Size,

@@ -12,7 +12,6 @@ pub(crate) fn encapsulation(endian: Endian, options: [u8; 2]) -> [u8; ENCAPSULAT
     [0, u8::from(endian == Endian::Little), a, b]
 }
 /// Pads `bytes` with zeros to a multiple of four, as DDS sends them: Cyclone DDS may read that far.
-/// far.
 pub(crate) fn pad(bytes: &mut Vec<u8>) {
     bytes.resize(bytes.len().next_multiple_of(4), 0);
 }

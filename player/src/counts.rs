@@ -1,6 +1,5 @@
-//! TopicCounts the messages of one topic: sent, lost, late.
+//! Counts the messages of one topic: sent, lost, late.
 
-/// Message counts of one topic.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct TopicCounts {
     pub(crate) sent: u64,

@@ -22,7 +22,6 @@ use gleaner_base::{Exit, Explain};
 use crate::buffer::Buffer;
 use crate::offer::Offer;
 
-/// Error of Cyclone DDS.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum CycloneError {
     /// A participant or a writer cannot be created.
@@ -57,7 +56,6 @@ const MAX_BLOCKING: Duration = Duration::from_secs(1);
 /// Larger than any message of ROS 2; the maximum that Cyclone DDS sends.
 const MAX_MESSAGE: usize = i32::MAX as usize - 8;
 
-/// A participant in a domain.
 pub(crate) struct Participant {
     participant: dds_entity_t,
 }
@@ -132,7 +130,6 @@ impl Drop for Participant {
     }
 }
 
-/// CycloneWriter of one topic.
 pub(crate) struct CycloneWriter<'p> {
     writer: dds_entity_t,
     /// The topic's type, which lives as long as the topic, and so as the participant.

@@ -28,6 +28,7 @@ use std::process::ExitCode;
 use clap::Parser;
 
 fn main() -> ExitCode {
+    gleaner_base::set_commit(option_env!("GLEANER_COMMIT"));
     match play::run(&args::Args::parse()) {
         Ok(exit) => exit.into(),
         Err(failure) => {

@@ -33,7 +33,6 @@ const NO_READERS: Duration = Duration::from_secs(3);
 /// Maximum wait at the end for readers to acknowledge all messages.
 const FLUSH: Duration = Duration::from_secs(5);
 
-/// Plays as the arguments request.
 pub(crate) fn run(args: &Args) -> Result<Exit, Failure> {
     let domain = args.domain(env::var("ROS_DOMAIN_ID").ok().as_deref())?;
     let stop = stop_on_signals()?;

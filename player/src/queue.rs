@@ -59,7 +59,6 @@ impl<'s> Queue<'s> {
         Queue { inner, changed: Condvar::new(), budget, stop }
     }
 
-    /// Number of lanes.
     pub(crate) fn lanes(&self) -> usize {
         self.lock().lanes.len()
     }

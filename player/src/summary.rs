@@ -5,7 +5,6 @@ use serde_json::{Value, json};
 use crate::counts::TopicCounts;
 use crate::source::PlayedTopic;
 
-/// Summary of one topic.
 pub(crate) struct TopicSummary<'t> {
     pub(crate) topic: &'t PlayedTopic,
     pub(crate) counts: TopicCounts,

@@ -7,7 +7,7 @@ use std::io::{self, BufRead, BufReader, Read};
 use std::marker::PhantomData;
 use std::path::{Path, PathBuf};
 
-use gleaner_base::{Exit, Explain, PlainFile};
+use gleaner_base::{Explain, PlainFile};
 use gleaner_lambda::results::{LINE_MAX, LINES_MAX};
 use gleaner_lambda::{Clip, Decision};
 use serde::de::DeserializeOwned;
@@ -49,10 +49,6 @@ impl Explain for ResultsError {
             "replay again, and let no other program write into the result folder meanwhile"
                 .to_owned(),
         )
-    }
-
-    fn exit(&self) -> Exit {
-        Exit::Internal
     }
 }
 

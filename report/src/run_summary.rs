@@ -110,9 +110,7 @@ impl Explain for OutputError {
 /// `summary.json` of a run.
 #[derive(Debug)]
 pub(crate) enum RunSummary {
-    /// The summary of a replay.
     Replay(Box<ReplaySummary>),
-    /// The summary of a live run.
     Live(Box<LiveStatus>),
 }
 

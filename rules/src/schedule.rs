@@ -220,7 +220,6 @@ impl PeriodicSchedule {
 mod tests {
     use super::*;
 
-    /// A ring without samples.
     #[derive(Debug)]
     struct EmptyRing;
 

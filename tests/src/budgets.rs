@@ -6,23 +6,23 @@
 /// Lines of Rust and Python of each folder at the top, without generated files: of sources, and of
 /// tests.
 pub const LINES: &[(&str, usize, usize)] = &[
-    ("base", 1198, 658),
-    ("bench", 11755, 745),
-    ("cli", 11189, 4352),
-    ("cloud", 19046, 6056),
+    ("base", 1226, 669),
+    ("bench", 11757, 745),
+    ("cli", 11121, 4477),
+    ("cloud", 18841, 6214),
     ("examples", 1318, 757),
     ("fuzz", 4216, 86),
     ("guest-sdk-python", 5876, 4099),
     ("guest-sdk-rust", 5394, 1621),
-    ("host", 62416, 30253),
+    ("host", 62175, 30122),
     ("journal", 1869, 1266),
     ("lambda", 4680, 2183),
-    ("orchestrator", 24591, 7775),
+    ("orchestrator", 24411, 7928),
     ("player", 2242, 793),
     ("report", 2802, 913),
     ("rules", 2707, 1191),
-    ("tests", 6532, 12170),
-    ("xtask", 7053, 622),
+    ("tests", 6545, 12198),
+    ("xtask", 6951, 774),
 ];
 
 /// Files with functions of more than 80 lines, each with its reason.

@@ -63,6 +63,24 @@ impl TestCloud {
         }
     }
 
+    /// Copies its data to the folder `name` while it runs, as docs/cloud.md has it.
+    ///
+    /// # Panics
+    ///
+    /// If that fails.
+    pub fn back_up(&self, name: &str) {
+        let (data, copy) = (self.path("data"), self.path(name));
+        std::fs::create_dir(&copy).expect("a folder");
+        let mut backup = Command::new(program("gleaner-cloud"));
+        backup.arg("backup").arg(copy.join("cloud.db")).arg("--data").arg(&data);
+        let mut rest = Command::new("cp");
+        rest.arg("-r").args(["objects", "clips", "records", "ca"].map(|it| data.join(it)));
+        for step in [&mut backup, rest.arg(copy)] {
+            let output = step.output().expect("it starts");
+            assert!(output.status.success(), "{}", text(&output));
+        }
+    }
+
     /// Returns a path in its folder.
     pub fn path(&self, name: &str) -> PathBuf {
         self.folder.path().join(name)

@@ -15,11 +15,9 @@ const SET_UP: &str = "ip link set lo up && ip link set lo multicast on && \
 
 /// Returns the reason why no private network can be created; `None` if one can.
 pub fn unavailable() -> Option<&'static str> {
-    if unshare_options().is_some() {
-        None
-    } else {
-        Some("cannot create a private network: `unshare -n` or `ip` is missing or not permitted")
-    }
+    let reason =
+        "cannot create a private network: `unshare -n` or `ip` is missing or not permitted";
+    unshare_options().is_none().then_some(reason)
 }
 
 /// Returns a command that runs `program` in a new private network, which ends with it.

@@ -2,7 +2,6 @@
 
 use std::env;
 
-/// An architecture of vehicles.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Architecture {
     Amd64,

@@ -10,9 +10,8 @@ use crate::setup;
 use crate::steps::{self, Steps};
 use crate::venv;
 
-/// Packages of the stand-in for ROS 2: name in pip, and name of the module.
-const STAND_IN: [(&str, &str); 3] =
-    [("cyclonedds", "cyclonedds.pub"), ("numpy", "numpy"), ("opencv-python-headless", "cv2")];
+/// Packages of the stand-in for ROS 2.
+const STAND_IN: [&str; 3] = ["cyclonedds", "numpy", "opencv-python-headless"];
 
 /// Runs the benchmark that the first argument names, or compares results.
 pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
@@ -34,7 +33,7 @@ fn fleet(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
     let mut steps = Steps::of(2);
     steps.begin("programs (the first time this takes minutes)");
     setup::programs(checkout)?;
-    setup::binary(checkout, "gleaner-fleet-bench")?;
+    setup::binaries(checkout, &["gleaner-fleet-bench"])?;
     steps.begin("measurements");
     start(checkout, "gleaner-fleet-bench", arguments)
 }
@@ -50,7 +49,7 @@ fn measure(checkout: &Checkout, name: &str, arguments: &[OsString]) -> Result<Ex
         println!("without the stand-in for ROS 2:\n{failure}");
     }
     steps.begin("gleaner-bench");
-    setup::binary(checkout, "gleaner-bench")?;
+    setup::binaries(checkout, &["gleaner-bench"])?;
     steps.begin("measurements");
     start(checkout, "gleaner-bench", arguments)
 }
@@ -63,7 +62,7 @@ fn parts(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
 }
 
 fn compare(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
-    setup::binary(checkout, "gleaner-bench")?;
+    setup::binaries(checkout, &["gleaner-bench"])?;
     start(checkout, "gleaner-bench", arguments)
 }
 

@@ -8,11 +8,10 @@ use gleaner_base::{Exit, Failure};
 use gleaner_lambda::manifest::GENERATED;
 use gleaner_report::format::trigger_lines;
 
-use crate::bindings;
 use crate::checkout::Checkout;
 use crate::examples::{DRIVE, EXAMPLES, Recipe, TwinReplay, difference};
 use crate::setup;
-use crate::steps::{self, Steps};
+use crate::steps::{self, Steps, cannot};
 
 /// Writes the files that are generated from the manifest's types, and the bindings of the Rust SDK,
 /// then `examples/*/expected.txt` with a line per trigger of the Rust twin, and
@@ -28,21 +27,18 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     }
     let mut steps = Steps::of(setup::STEPS + 2);
     steps.begin("bindings of the Rust SDK");
-    let mut write_bindings = bindings::test(checkout);
+    let mut write_bindings = setup::test_bindings(checkout);
     steps::run(write_bindings.env("GLEANER_BLESS", "1"), "see the first error above")?;
     setup::run(checkout, &mut steps, &checkout.lambdas(&["examples"]))?;
     steps.begin(&format!("expected decisions on {DRIVE}"));
     for example in &EXAMPLES {
         let twins = example.replay(checkout)?;
         if let Some(what) = difference(&twins) {
-            let mut failure = Failure::new(
-                Exit::Differs,
-                format!("the twins of example `{}` differ", example.name),
-            );
+            let message = format!("the twins of example `{}` differ", example.name);
+            let mut failure = Failure::new(Exit::Differs, message);
             failure.causes = vec![what];
-            return Err(failure.with_help(
-                "compare their decisions.jsonl in out/demo, and correct one of the two",
-            ));
+            let help = "compare their decisions.jsonl in out/demo, and correct one of the two";
+            return Err(failure.with_help(help));
         }
         let [rust, _] = &twins;
         write(
@@ -67,10 +63,7 @@ fn rows(run: &TwinReplay) -> String {
 
 /// Writes and prints a file of the checkout.
 fn write(checkout: &Checkout, file: &Path, text: String) -> Result<(), Failure> {
-    let file_name = file.display();
-    fs::write(checkout.path(file), &text).map_err(|error| {
-        Failure::caused_by(Exit::Internal, format!("cannot write `{file_name}`"), &error)
-    })?;
-    println!("{file_name}:\n{text}");
+    fs::write(checkout.path(file), &text).map_err(|error| cannot("write", file, &error))?;
+    println!("{}:\n{text}", file.display());
     Ok(())
 }

@@ -11,10 +11,13 @@ use gleaner_base::{Exit, Failure};
 /// Folders of lambdas; each lambda has a folder with one for each of its twins.
 pub(crate) const FAMILIES: [&str; 3] = ["bench/lambdas", "examples", "tests/lambdas"];
 
+#[derive(Clone)]
 pub(crate) struct Checkout {
     root: PathBuf,
     target: PathBuf,
     cargo: OsString,
+    /// The commit that programs print which cargo builds.
+    commit: Option<String>,
 }
 
 impl Checkout {
@@ -37,18 +40,42 @@ impl Checkout {
         let exe = env::current_exe().ok().filter(|exe| exe.is_absolute());
         let target = exe.as_deref().and_then(|exe| exe.ancestors().nth(2));
         let target = target.ok_or_else(|| lost("cannot find the target folder"))?.to_owned();
-        Ok(Checkout { root, target, cargo })
+        Ok(Checkout { root, target, cargo, commit: None })
     }
 
     /// A checkout in `root`, with the program `cargo` in place of cargo.
     #[cfg(test)]
     pub(crate) fn with_cargo(root: PathBuf, cargo: OsString) -> Checkout {
-        Checkout { target: root.join("target"), root, cargo }
+        Checkout { target: root.join("target"), root, cargo, commit: None }
+    }
+
+    /// Commits all files of a test; returns the commit.
+    #[cfg(test)]
+    pub(crate) fn commit_all(&self) -> String {
+        self.git(&["init", "--quiet"]);
+        self.git(&["add", "."]);
+        self.git(&["commit", "--quiet", "-m", "x"]);
+        self.git(&["rev-parse", "HEAD"])
+    }
+
+    /// Runs git in a repository of a test; returns its output.
+    #[cfg(test)]
+    pub(crate) fn git(&self, arguments: &[&str]) -> String {
+        let mut git = self.command("git");
+        git.args(["-c", "user.name=x", "-c", "user.email=x@localhost"]).args(arguments);
+        let output = git.output().unwrap();
+        assert!(output.status.success(), "{arguments:?}");
+        String::from_utf8(output.stdout).unwrap().trim().to_owned()
     }
 
     /// Another checkout, in `root`, with a target folder of its own.
     pub(crate) fn other(&self, root: PathBuf) -> Checkout {
-        Checkout { target: root.join("target"), root, cargo: self.cargo.clone() }
+        Checkout { target: root.join("target"), root, ..self.clone() }
+    }
+
+    /// The same checkout, whose cargo builds programs that print `commit` with their versions.
+    pub(crate) fn with_commit(&self, commit: Option<String>) -> Checkout {
+        Checkout { commit, ..self.clone() }
     }
 
     pub(crate) fn path(&self, relative: impl AsRef<Path>) -> PathBuf {
@@ -95,6 +122,7 @@ impl Checkout {
     pub(crate) fn cargo(&self) -> Command {
         let mut cargo = self.command(&self.cargo);
         remove_package(&mut cargo);
+        cargo.envs(self.commit.iter().map(|commit| ("GLEANER_COMMIT", commit)));
         cargo
     }
 

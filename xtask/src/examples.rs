@@ -33,30 +33,20 @@ pub(crate) struct Example {
     pub(crate) has_models: bool,
 }
 
+const fn example(name: &'static str, set: &'static [&'static str]) -> Example {
+    Example { name, set, to: None, is_stateless: true, has_models: false }
+}
+
 pub(crate) const EXAMPLES: [Example; 4] = [
-    Example {
-        name: "hello",
-        set: &["brake_mps2=-1.4"],
-        to: None,
-        is_stateless: true,
-        has_models: false,
-    },
-    Example {
-        name: "brake-dark",
-        set: &["brake_mps2=-1.4", "dark_luma=50"],
-        to: None,
-        is_stateless: true,
-        has_models: false,
-    },
+    example("hello", &["brake_mps2=-1.4"]),
+    example("brake-dark", &["brake_mps2=-1.4", "dark_luma=50"]),
     // Its consecutive windows depend on the first sample of the drive.
-    Example { name: "imu-fft", set: &[], to: None, is_stateless: false, has_models: false },
+    Example { is_stateless: false, ..example("imu-fft", &[]) },
     // Some 50 ms for each frame.
     Example {
-        name: "yolo-detector",
-        set: &["classes=car, truck"],
         to: Some("3"),
-        is_stateless: true,
         has_models: true,
+        ..example("yolo-detector", &["classes=car, truck"])
     },
 ];
 
@@ -104,7 +94,6 @@ pub(crate) struct Recipe {
 }
 
 impl Recipe {
-    /// Finds all recipes.
     pub(crate) fn all(checkout: &Checkout) -> Result<Vec<Recipe>, Failure> {
         let folders = checkout
             .lambdas(&["examples"])
@@ -157,20 +146,12 @@ fn replay(
 ) -> Result<TwinReplay, Failure> {
     let out = Path::new("out/demo").join(name);
     let mut replay = with_models(checkout, "gleaner");
-    replay
-        .arg("replay")
-        .arg(&lambda)
-        .arg(DRIVE)
-        .args(settings)
-        .arg("--out")
-        .arg(&out)
-        .arg("--json");
+    replay.arg("replay").arg(&lambda).args([DRIVE, "--json"]).args(settings).arg("--out").arg(&out);
     // The folder may be missing, and a journal of an earlier demo is replaced.
-    fs::create_dir_all(checkout.path(&out))
-        .map_err(|error| Failure::caused_by(Exit::Internal, "cannot make `out/demo`", &error))?;
+    let folder = checkout.path(&out);
+    steps::make_folder(&folder)?;
     replay.arg("--journal").arg(out.join(JOURNAL));
     let summary: ReplaySummary = report(&mut replay)?;
-    let folder = checkout.path(&out);
     let clips = if summary.recording.clips > 0 { clips(&folder)? } else { Vec::new() };
     Ok(TwinReplay { decisions: decisions(&folder)?, clips, summary, lambda, out })
 }
@@ -179,13 +160,8 @@ impl TwinReplay {
     /// Repeats every decision of the journal, from the drive.
     pub(crate) fn verify(&self, checkout: &Checkout) -> Result<Verified, Failure> {
         let mut verify = with_models(checkout, "gleaner");
-        verify
-            .arg("replay")
-            .arg(&self.lambda)
-            .arg(DRIVE)
-            .arg("--verify")
-            .arg(self.out.join(JOURNAL))
-            .arg("--json");
+        verify.arg("replay").arg(&self.lambda).args([DRIVE, "--json", "--verify"]);
+        verify.arg(self.out.join(JOURNAL));
         report(&mut verify)
     }
 
@@ -196,12 +172,8 @@ impl TwinReplay {
         clip: &Clip,
     ) -> Result<Verified, Failure> {
         let mut verify = with_models(checkout, "gleaner");
-        verify
-            .arg("verify")
-            .arg(self.out.join(&clip.file))
-            .arg("--lambda")
-            .arg(&self.lambda)
-            .arg("--json");
+        verify.args(["verify", "--json"]).arg(self.out.join(&clip.file));
+        verify.arg("--lambda").arg(&self.lambda);
         report(&mut verify)
     }
 
@@ -216,9 +188,7 @@ fn report<T: serde::de::DeserializeOwned>(
     gleaner: &mut std::process::Command,
 ) -> Result<T, Failure> {
     let json = steps::output(gleaner, "see the error above; the results up to it are in out/demo")?;
-    serde_json::from_str(&json).map_err(|error| {
-        Failure::caused_by(Exit::Internal, "`gleaner --json` gave no report", &error)
-    })
+    steps::parsed(&json, "gleaner --json")
 }
 
 fn decisions(out: &Path) -> Result<Vec<Decision>, ResultsError> {

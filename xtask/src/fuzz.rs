@@ -43,7 +43,6 @@ targets: message, drive, bag, image, journal, link, ingress, manifest, trust, mo
 --seconds N  time for each target [default: 60]; targets run in parallel, one per core
 --seed N     makes runs of the same programs with the same inputs reproducible";
 
-/// Builds and runs the requested targets.
 pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
     let args = FuzzArgs::of(arguments)?;
     let fuzz = Fuzz {
@@ -80,25 +79,21 @@ impl FuzzArgs {
         let mut args = FuzzArgs { targets: Vec::new(), seconds: 60, seed: None };
         let mut words = arguments.iter().map(|argument| argument.to_string_lossy());
         while let Some(word) = words.next() {
-            if word == "--seconds" {
-                let seconds = words
-                    .next()
-                    .and_then(|seconds| seconds.parse().ok())
-                    .filter(|seconds| *seconds > 0);
-                args.seconds = seconds
-                    .ok_or_else(|| refused("`--seconds` takes a whole number".to_owned()))?;
-            } else if word == "--seed" {
-                let seed = words.next().and_then(|seed| seed.parse().ok()).filter(|seed| *seed > 0);
-                args.seed =
-                    Some(seed.ok_or_else(|| {
-                        refused("`--seed` takes a whole number above 0".to_owned())
-                    })?);
-            } else {
-                let target = TARGETS.into_iter().find(|name| *name == word);
-                let target =
-                    target.ok_or_else(|| refused(format!("there is no target `{word}`")))?;
-                if !args.targets.contains(&target) {
-                    args.targets.push(target);
+            let mut number = || {
+                let number = words.next().and_then(|number| number.parse().ok());
+                let number = number.filter(|number: &u64| *number > 0);
+                number.ok_or_else(|| refused(format!("`{word}` takes a whole number above 0")))
+            };
+            match &*word {
+                "--seconds" => args.seconds = number()?,
+                "--seed" => args.seed = Some(number()?),
+                name => {
+                    let target = TARGETS.into_iter().find(|target| *target == name);
+                    let target =
+                        target.ok_or_else(|| refused(format!("there is no target `{name}`")))?;
+                    if !args.targets.contains(&target) {
+                        args.targets.push(target);
+                    }
                 }
             }
         }
@@ -113,14 +108,7 @@ impl FuzzArgs {
 /// compiler.
 pub(crate) fn driver(checkout: &Checkout) -> Result<(), Failure> {
     setup::target(checkout, setup::TARGET)?;
-    // With the features of the default build, so that nothing is built twice.
-    let mut build = checkout.cargo();
-    build.args(["build", "--release", "--bin", "gleaner", "--bin", "gleaner-compile"]);
-    steps::run(
-        &mut build,
-        "if a linker or a C compiler is missing, install one (`cc`); else see the first error \
-         above",
-    )?;
+    setup::binaries(checkout, &["gleaner", "gleaner-compile"])?;
     setup::build_lambdas(checkout, &[PathBuf::from(DRIVER)])?;
     let mut compile = checkout.command(checkout.program("gleaner-compile"));
     let code = checkout.path(DRIVER).join("build/driver.wasm");
@@ -138,32 +126,25 @@ struct Fuzz<'c> {
 impl Fuzz<'_> {
     /// Builds the programs of these targets; returns their folder.
     fn programs(&self, names: &[&str]) -> Result<PathBuf, Failure> {
-        let mut rustc =
-            self.checkout.command(std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into()));
-        let machine =
-            steps::output(rustc.args(["--print", "host-tuple"]), "install Rust with rustup")?;
-        let machine = machine.trim();
+        let machine = setup::rustc(self.checkout, &["--print", "host-tuple"])?;
         let mut build = self.checkout.cargo();
         // With an explicit target, the flags do not apply to build scripts.
-        build.args(["build", "--profile", "fuzz", "-p", "gleaner-fuzz", "--target", machine]);
+        build.args(["build", "--profile", "fuzz", "-p", "gleaner-fuzz", "--target", &machine]);
         for name in names {
             build.args(["--bin", &format!("fuzz-{name}")]);
         }
         build.args(["--no-default-features", "--features"]);
         build.arg(if names.contains(&CALLS) { "programs,calls" } else { "programs" });
-        build
-            .env("CARGO_TARGET_DIR", &self.build)
-            .env("RUSTFLAGS", FLAGS)
-            .env_remove("CARGO_ENCODED_RUSTFLAGS");
-        steps::run(
-            &mut build,
-            "if a C++ compiler is missing, install one (`c++`); else see the first error above",
-        )?;
+        build.env("CARGO_TARGET_DIR", &self.build);
+        build.env("RUSTFLAGS", FLAGS).env_remove("CARGO_ENCODED_RUSTFLAGS");
+        let help =
+            "if a C++ compiler is missing, install one (`c++`); else see the first error above";
+        steps::run(&mut build, help)?;
         Ok(self.build.join(machine).join("fuzz"))
     }
 
     fn seeds(&self) -> Result<(), Failure> {
-        setup::binary(self.checkout, "fuzz-seeds")?;
+        setup::binaries(self.checkout, &["fuzz-seeds"])?;
         let mut seeds = self.checkout.command(self.checkout.program("fuzz-seeds"));
         steps::run(seeds.arg(self.build.join("seeds")), "see the error above")
     }
@@ -198,10 +179,9 @@ impl Fuzz<'_> {
         let output = File::create(&log).map_err(|error| cannot("write", &log, &error))?;
         let mut fuzzer = self.checkout.command(&program);
         // The corpus of earlier runs is kept and extended.
-        fuzzer
-            .arg(folder(self.build.join("corpus").join(name))?)
-            .arg(self.build.join("seeds").join(name));
-        fuzzer.arg(option("dict", self.build.join("seeds").join(format!("{name}.dict")).display()));
+        let seeds = self.build.join("seeds");
+        fuzzer.arg(folder(self.build.join("corpus").join(name))?).arg(seeds.join(name));
+        fuzzer.arg(option("dict", seeds.join(format!("{name}.dict")).display()));
         fuzzer.arg(option("artifact_prefix", format!("{}/", findings.display())));
         fuzzer.args(self.seed.map(|seed| option("seed", seed)));
         fuzzer.arg(option("max_total_time", self.seconds)).arg(option("max_len", longest.trim()));
@@ -259,8 +239,7 @@ fn option(name: &str, value: impl std::fmt::Display) -> String {
 }
 
 fn folder(path: PathBuf) -> Result<PathBuf, Failure> {
-    fs::create_dir_all(&path).map_err(|error| cannot("make folder", &path, &error))?;
-    Ok(path)
+    steps::make_folder(&path).map(|()| path)
 }
 
 #[cfg(test)]
@@ -287,17 +266,10 @@ mod tests {
         let some = ["drive", "--seconds", "5", "image", "--seed", "7", "drive"];
         let some = args(&some).unwrap_or_else(|failure| panic!("{failure}"));
         assert_eq!((some.targets, some.seconds, some.seed), (vec!["drive", "image"], 5, Some(7)));
-        let nonsense = [
-            ["--seconds", "0"],
-            ["--seconds", "-1"],
-            ["--seed", "0"],
-            ["--seed", "x"],
-            ["drive", "x"],
-        ];
-        for wrong in
-            nonsense.iter().map(|wrong| &wrong[..]).chain([&["x"][..], &["--seconds"], &["--seed"]])
-        {
-            assert!(args(wrong).is_err_and(|failure| failure.exit == Exit::Usage), "{wrong:?}");
+        let wrong = "--seconds 0,--seconds -1,--seed 0,--seed x,drive x,x,--seconds,--seed";
+        for wrong in wrong.split(',') {
+            let wrong: Vec<_> = wrong.split(' ').collect();
+            assert!(args(&wrong).is_err_and(|failure| failure.exit == Exit::Usage), "{wrong:?}");
         }
     }
 }

@@ -7,7 +7,6 @@
 mod aarch64;
 mod architecture;
 mod bench;
-mod bindings;
 mod bless;
 mod checkout;
 mod deb;
@@ -24,6 +23,7 @@ mod onnxruntime;
 mod page;
 mod peers;
 mod player;
+mod private_folder;
 mod records;
 mod revisions;
 mod setup;
@@ -85,49 +85,33 @@ fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
         Some((command, rest)) => (command.to_str().unwrap_or_default(), rest),
         None => ("", &[][..]),
     };
-    let has_arguments = [
-        "bench",
-        "deb",
-        "demo",
-        demo::VEHICLE_COMMAND,
-        "dist",
-        "fleet",
-        "fuzz",
-        "page",
-        "peers",
-        "record",
-        "test",
-    ];
-    if !rest.is_empty() && !has_arguments.contains(&command) {
-        return Err(Failure::new(
-            Exit::Usage,
-            format!("`cargo xtask {command}` takes no arguments"),
-        )
-        .with_help(USAGE));
-    }
     let checkout = Checkout::find()?;
-    match command {
-        "demo" => demo::run(&checkout, rest),
-        demo::VEHICLE_COMMAND => demo::run_vehicle(&checkout, rest),
-        "full" => records::full(&checkout),
-        "record" => records::print(&checkout, rest),
-        "test" => suites::run(&checkout, rest),
-        "bless" => bless::run(&checkout),
-        "docs" => docs::run(&checkout),
-        "bench" => bench::run(&checkout, rest),
-        "fleet" => fleet::run_scaled(&checkout, rest),
-        "fuzz" => fuzz::run(&checkout, rest),
-        "models" => models::run(&checkout),
-        "page" => page::run_flows(&checkout, rest),
-        "peers" => peers::build(&checkout, rest),
-        "player" => player::run(&checkout),
-        "deb" => deb::run(&checkout, rest),
-        "dist" => dist::run(&checkout, rest),
-        "aarch64" => aarch64::run(&checkout),
-        "build" => {
+    match (command, rest) {
+        ("demo", _) => demo::run(&checkout, rest),
+        (demo::VEHICLE_COMMAND, _) => demo::run_vehicle(&checkout, rest),
+        ("full", []) => records::full(&checkout),
+        ("record", _) => records::print(&checkout, rest),
+        ("test", _) => suites::run(&checkout, rest),
+        ("bless", []) => bless::run(&checkout),
+        ("docs", []) => docs::run(&checkout),
+        ("bench", _) => bench::run(&checkout, rest),
+        ("fleet", _) => fleet::run_scaled(&checkout, rest),
+        ("fuzz", _) => fuzz::run(&checkout, rest),
+        ("models", []) => models::run(&checkout),
+        ("page", _) => page::run_flows(&checkout, rest),
+        ("peers", _) => peers::build(&checkout, rest),
+        ("player", []) => player::run(&checkout),
+        ("deb", _) => deb::run(&checkout, rest),
+        ("dist", _) => dist::run(&checkout, rest),
+        ("aarch64", []) => aarch64::run(&checkout),
+        ("build", []) => {
             setup::run(&checkout, &mut Steps::of(setup::STEPS), &checkout.lambdas(&FAMILIES))
                 .map(|()| Exit::Ok)
         }
-        _ => Err(Failure::new(Exit::Usage, "no such command").with_help(USAGE)),
+        ("", _) => Err(Failure::new(Exit::Usage, "a command is missing").with_help(USAGE)),
+        _ => {
+            let message = format!("`cargo xtask {command}` is unknown, or takes no arguments");
+            Err(Failure::new(Exit::Usage, message).with_help(USAGE))
+        }
     }
 }

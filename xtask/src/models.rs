@@ -7,10 +7,8 @@ use crate::checkout::Checkout;
 use crate::steps::{self, Steps};
 use crate::venv;
 
-/// Packages of Python: name and version in pip, and name of the module. The results of other
-/// versions differ.
-const PACKAGES: [(&str, &str); 3] =
-    [("onnx==1.23.2", "onnx"), ("onnxruntime==1.32.0", "onnxruntime"), ("numpy", "numpy")];
+/// Packages of Python. The results of other versions differ.
+const PACKAGES: [&str; 3] = ["onnx==1.23.2", "onnxruntime==1.32.0", "numpy"];
 
 /// Compares results, and the page that is generated from them.
 pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {

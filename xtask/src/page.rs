@@ -2,7 +2,6 @@
 //! real. `--install` fetches the browser's package first.
 
 use std::ffi::OsString;
-use std::fs;
 use std::path::Path;
 
 use gleaner_base::{Exit, Failure};
@@ -18,14 +17,7 @@ const MODULES: [&str; 2] = ["playwright-core@1.65.1", "axe-core@4.14.1"];
 
 /// Runs the flows of `cloud/server/tests/page`.
 pub(crate) fn run_flows(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
-    let is_installing = match arguments {
-        [] => false,
-        [one] if one == "--install" => true,
-        _ => {
-            let message = "`cargo xtask page` takes `--install` or nothing";
-            return Err(Failure::new(Exit::Usage, message));
-        }
-    };
+    let is_installing = steps::has_flag("page", "--install", arguments)?;
     let folder = checkout.target().join("page");
     let mut steps = Steps::of(4);
     steps.begin("browser and Node.js");
@@ -76,10 +68,7 @@ fn missing(checkout: &Checkout) -> Vec<&'static str> {
 }
 
 fn modules(checkout: &Checkout, folder: &Path) -> Result<(), Failure> {
-    fs::create_dir_all(folder).map_err(|error| {
-        let action = format!("cannot make folder `{}`", folder.display());
-        Failure::caused_by(Exit::Internal, action, &error)
-    })?;
+    steps::make_folder(folder)?;
     let mut install = checkout.command("npm");
     // Scripts of packages are not run: these need none.
     install.args(["install", "--ignore-scripts", "--no-audit", "--no-fund", "--prefer-offline"]);

@@ -3,7 +3,6 @@
 //! others the missing packages are named.
 
 use std::ffi::OsString;
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use gleaner_base::{Exit, Failure};
@@ -26,16 +25,7 @@ const COMPILER: &str = "see the first error above; a C and a C++ compiler are ne
 
 /// Builds the peers; `--install` fetches what is missing first.
 pub(crate) fn build(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
-    let install = match arguments {
-        [] => false,
-        [one] if one == "--install" => true,
-        _ => {
-            return Err(Failure::new(
-                Exit::Usage,
-                "`cargo xtask peers` takes `--install` or nothing",
-            ));
-        }
-    };
+    let install = steps::has_flag("peers", "--install", arguments)?;
     let peers = Peers { checkout, folder: checkout.target().join("peers") };
     let mut steps = Steps::of(4);
     steps.begin("packages");
@@ -44,15 +34,13 @@ pub(crate) fn build(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit,
         steps::install(checkout, &missing)?;
     }
     steps.begin("Cyclone DDS in C");
-    let cyclone = peers.has_cyclone();
-    if cyclone {
+    if peers.has_cyclone() {
         peers.cyclone()?;
     } else {
         println!("skipped: {} are missing", CYCLONE.join(" and "));
     }
     steps.begin("Fast DDS in C++");
-    let fast = peers.has_fast();
-    if fast {
+    if peers.has_fast() {
         peers.fast()?;
     } else {
         println!("skipped: {} are missing", FAST.join(", "));
@@ -112,14 +100,7 @@ impl Peers<'_> {
     /// A folder below `peers/` for generated files.
     fn generated(&self, name: &str) -> Result<PathBuf, Failure> {
         let folder = self.folder.join(name);
-        fs::create_dir_all(&folder).map_err(|error| {
-            Failure::caused_by(
-                Exit::Internal,
-                format!("cannot make folder `{}`", folder.display()),
-                &error,
-            )
-        })?;
-        Ok(folder)
+        steps::make_folder(&folder).map(|()| folder)
     }
 
     fn source(&self, name: &str) -> PathBuf {
@@ -174,7 +155,6 @@ impl Peers<'_> {
     }
 
     fn python(&self) -> Result<(), Failure> {
-        let packages = [("cyclonedds", "cyclonedds.pub")];
-        venv::apart(self.checkout, &self.folder.join("venv"), &packages).map(drop)
+        venv::apart(self.checkout, &self.folder.join("venv"), &["cyclonedds"]).map(drop)
     }
 }

@@ -22,7 +22,6 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     Ok(Exit::Ok)
 }
 
-/// Builds the player for this machine.
 pub(crate) fn build(checkout: &Checkout) -> Result<(), Failure> {
     let mut build = cargo(checkout, &compiler())?;
     // With the features of the whole workspace, so that shared dependencies are built once.
@@ -97,11 +96,8 @@ fn fetch(checkout: &Checkout) -> Result<(), Failure> {
 fn path_with(folder: PathBuf) -> Result<OsString, Failure> {
     let path = env::var_os("PATH").unwrap_or_default();
     env::join_paths(env::split_paths(&path).chain([folder])).map_err(|error| {
-        Failure::caused_by(
-            Exit::Internal,
-            "the path of the checkout cannot be part of PATH",
-            &error,
-        )
+        let message = "the path of the checkout cannot be part of PATH";
+        Failure::caused_by(Exit::Internal, message, &error)
     })
 }
 

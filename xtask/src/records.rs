@@ -14,7 +14,7 @@ use sha2::{Digest, Sha256};
 use crate::checkout::Checkout;
 use crate::metadata::Metadata;
 use crate::setup::PROGRAMS;
-use crate::steps;
+use crate::steps::{self, cannot};
 
 /// File of the records, relative to the checkout.
 const FILE: &str = ".ci/full.json";
@@ -89,7 +89,7 @@ const HEAVY: [HeavyPart; 8] = [
         name: "cloud of three replicas, with kills",
         packages: &["gleaner-fleet-bench", "gleaner-cloud"],
         has_programs: false,
-        files: &["xtask/src/fleet"],
+        files: &["xtask/src/fleet", "xtask/src/private_folder.rs"],
         counted: (4, "kills", "kill "),
         tests_follow: true,
     },
@@ -103,6 +103,7 @@ const HEAVY: [HeavyPart; 8] = [
             "xtask/src/demo",
             "xtask/src/examples.rs",
             "xtask/src/onnxruntime.rs",
+            "xtask/src/private_folder.rs",
         ],
         counted: (1, "verified clips", "signed by the vehicle"),
         tests_follow: false,
@@ -153,10 +154,8 @@ pub(crate) fn full(checkout: &Checkout) -> Result<Exit, Failure> {
     let tested = state()?;
     let results = checkout.target().join("full");
     // Those of an earlier run would count if this one ended before it wrote its own.
-    if results.exists() {
-        fs::remove_dir_all(&results).map_err(|error| cannot("remove", &results, &error))?;
-    }
-    fs::create_dir_all(&results).map_err(|error| cannot("make", &results, &error))?;
+    steps::remove_folder(&results)?;
+    steps::make_folder(&results)?;
     let mut run = checkout.script(".ci/run");
     let ended = steps::run(
         run.arg("--full").arg(&results),
@@ -198,33 +197,39 @@ fn write(
         let record = Record { digest, commit, seconds, cpu_seconds, result };
         records.insert(part.name.to_owned(), record);
     }
-    save(checkout, &records).map(drop)
+    save(checkout, &records)
 }
 
-fn save(checkout: &Checkout, records: &PartRecords) -> Result<Exit, Failure> {
+fn save(checkout: &Checkout, records: &PartRecords) -> Result<(), Failure> {
     let json = serde_json::to_string_pretty(records)
         .map_err(|error| Failure::caused_by(Exit::Internal, "cannot write records", &error))?;
     let file = checkout.path(FILE);
     fs::write(&file, json + "\n").map_err(|error| cannot("write", &file, &error))?;
     println!("wrote {FILE}; commit it");
-    Ok(Exit::Ok)
+    Ok(())
 }
 
 /// After a change of the rule which files a part depends on, writes the digests of the parts of
-/// which no such file has changed since the commit of their records.
+/// which no such file has changed since the commit of their records. If one has, the exit code is
+/// [`Exit::Differs`].
 fn renew(checkout: &Checkout) -> Result<Exit, Failure> {
     let sources = CheckoutSources::read(checkout)?;
     let mut records = read(checkout)?;
+    let mut exit = Exit::Ok;
     for part in &HEAVY {
         let Some(record) = records.get_mut(part.name) else { continue };
         let changed = git(checkout, &["diff", "--name-only", "--no-renames", &record.commit])?;
         let is_used = sources.used_by(part);
         match changed.lines().find(|path| is_used(path)) {
-            Some(path) => println!("{}: {path} has changed", part.name),
+            Some(path) => {
+                println!("not renewed: `{}`, as {path} has changed", part.name);
+                exit = Exit::Differs;
+            }
             None => record.digest = sources.digest(checkout, part)?,
         }
     }
-    save(checkout, &records)
+    save(checkout, &records)?;
+    Ok(exit)
 }
 
 fn read(checkout: &Checkout) -> Result<PartRecords, Failure> {
@@ -310,7 +315,7 @@ impl CheckoutSources {
         let mut list = checkout.command("git");
         let files = steps::output(list.args(["ls-files", "-z"]), "run it in a checkout")?;
         let files = files.split('\0').filter(|path| !path.is_empty()).map(str::to_owned);
-        let metadata = Metadata::read(checkout)?;
+        let metadata = Metadata::read(checkout, "--no-deps")?;
         let root = checkout.path("");
         let mut sources = Self {
             files: files.collect(),
@@ -355,10 +360,8 @@ impl CheckoutSources {
         let is_used = self.used_by(part);
         let mut digest = Sha256::new();
         for path in self.files.iter().filter(|path| is_used(path)) {
-            let bytes = fs::read(checkout.path(path)).map_err(|error| {
-                let path = checkout.path(path);
-                cannot("read", &path, &error)
-            })?;
+            let file = checkout.path(path);
+            let bytes = fs::read(&file).map_err(|error| cannot("read", &file, &error))?;
             digest.update(format!("{path}\0{}\0", bytes.len()));
             digest.update(&bytes);
         }
@@ -381,13 +384,10 @@ impl CheckoutSources {
     }
 }
 
-fn cannot(what: &str, path: &Path, error: &dyn std::error::Error) -> Failure {
-    Failure::caused_by(Exit::Internal, format!("cannot {what} `{}`", path.display()), error)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::test_folder::TestFolder;
 
     #[test]
     fn the_heavy_parts_are_those_of_the_script() {
@@ -395,5 +395,31 @@ mod tests {
         let named = script.lines().filter_map(|line| line.strip_prefix("heavy \""));
         let named: Vec<_> = named.filter_map(|rest| rest.split('"').next()).collect();
         assert_eq!(named, HEAVY.map(|part| part.name));
+    }
+
+    #[test]
+    fn a_part_that_stays_stale_is_a_failure() {
+        let folder = TestFolder::new();
+        // A workspace of one package.
+        let cargo = r#"#!/bin/sh
+echo '{"packages": [{"name": "gleaner-inference", "manifest_path": "'$PWD'/host/Cargo.toml",
+"version": "1.0.0", "dependencies": []}]}'"#;
+        let cargo = folder.write_program("target/cargo", cargo);
+        let checkout = Checkout::with_cargo(folder.root().to_owned(), cargo.into());
+        for (file, text) in [(".gitignore", "target\n"), (FILE, "{}"), ("host/lib.rs", "one")] {
+            folder.write(file, text);
+        }
+        let (name, digest) = ("models, by the tests of ONNX", "by an older rule".to_owned());
+        let commit = checkout.commit_all();
+        let record = Record { digest, commit, seconds: 1, cpu_seconds: 1, result: String::new() };
+        save(&checkout, &PartRecords::from([(name.to_owned(), record)])).unwrap();
+        let renewed = || {
+            let exit = renew(&checkout).unwrap();
+            (exit, read(&checkout).unwrap().remove(name).unwrap().digest)
+        };
+        let (exit, current) = renewed();
+        assert_eq!((exit, current.len()), (Exit::Ok, 64));
+        folder.write("host/lib.rs", "two");
+        assert_eq!(renewed(), (Exit::Differs, current));
     }
 }

@@ -21,18 +21,8 @@ const USAGE: &str =
 const ROUNDS: usize = 5;
 
 /// Benchmarks with results that can be compared.
-const BENCHMARKS: [&str; 10] = [
-    "rtt",
-    "scale",
-    "isolation",
-    "cold-start",
-    "replay",
-    "record",
-    "drives",
-    "kernels",
-    "inference",
-    "fleet",
-];
+const BENCHMARKS: &str =
+    "rtt, scale, isolation, cold-start, replay, record, drives, kernels, inference, fleet";
 
 /// Benchmarks that need gleaner-player, which is not built with the other programs.
 const LIVE: [&str; 3] = ["rtt", "scale", "isolation"];
@@ -54,10 +44,10 @@ pub(crate) fn measure(
     rest: &[OsString],
 ) -> Result<[PathBuf; 2], Failure> {
     let (rounds, options) = rounds(rest)?;
-    if !BENCHMARKS.iter().any(|known| name == *known) {
+    if !BENCHMARKS.split(", ").any(|known| name == known) {
         let message = format!("`{}` cannot be measured in two revisions", name.display());
         return Err(Failure::new(Exit::Usage, message)
-            .with_help(format!("name one of these: {}", BENCHMARKS.join(", "))));
+            .with_help(format!("name one of these: {BENCHMARKS}")));
     }
     let folder = checkout.target().join("revisions");
     fs::create_dir_all(&folder).map_err(|error| cannot_use(&folder, &error))?;
@@ -111,14 +101,14 @@ impl Revision {
         restore.args(["checkout", "--quiet", "--force", "--detach", &self.commit]);
         if !folder.join(".git").is_file() || !steps::succeeds(&mut restore) {
             // There is none yet, or git was interrupted in it.
-            remove(&folder)?;
+            steps::remove_folder(&folder)?;
             let mut add = checkout.command("git");
             add.args(["worktree", "add", "--force", "--detach"]).arg(&folder).arg(&self.commit);
             steps::run(&mut add, "see the message of git above")?;
         }
         let trial = self.checkout.target().join("bench/trial");
         for old in [&self.runs, &trial] {
-            remove(old)?;
+            steps::remove_folder(old)?;
         }
         if LIVE.iter().any(|live| name == *live) {
             let mut player = self.cargo();
@@ -189,16 +179,6 @@ fn commit(checkout: &Checkout, revision: &OsStr) -> Result<String, Failure> {
     Ok(commit.trim().to_owned())
 }
 
-/// Removes a folder, if there is one.
-fn remove(folder: &Path) -> Result<(), Failure> {
-    match fs::remove_dir_all(folder) {
-        Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-            Err(cannot_use(folder, &error))
-        }
-        _ => Ok(()),
-    }
-}
-
 fn warn_of_changes(checkout: &Checkout) -> Result<(), Failure> {
     let mut status = checkout.command("git");
     status.args(["status", "--porcelain", "--untracked-files=no"]);
@@ -209,8 +189,7 @@ fn warn_of_changes(checkout: &Checkout) -> Result<(), Failure> {
 }
 
 fn cannot_use(path: &Path, error: &std::io::Error) -> Failure {
-    Failure::caused_by(Exit::Internal, format!("cannot use `{}`", path.display()), error)
-        .with_help("the target folder has to be writable")
+    steps::cannot("use", path, error).with_help("the target folder has to be writable")
 }
 
 #[cfg(test)]
@@ -238,12 +217,10 @@ exit 1
             let repository = Self(TestFolder::new());
             repository.0.write_program("bin/cargo", CARGO);
             repository.0.write(".gitignore", "target\nbin\n");
-            repository.git(&["init", "--quiet"]);
             for value in ["one", "two", "broken"] {
                 repository.0.write("value", value);
-                repository.git(&["add", "."]);
-                repository.git(&["commit", "--quiet", "-m", value]);
-                repository.git(&["tag", value]);
+                repository.checkout().commit_all();
+                repository.checkout().git(&["tag", value]);
             }
             repository
         }
@@ -251,12 +228,6 @@ exit 1
         fn checkout(&self) -> Checkout {
             let (root, cargo) = (self.0.root().to_owned(), self.0.path("bin/cargo"));
             Checkout::with_cargo(root, cargo.into())
-        }
-
-        fn git(&self, args: &[&str]) {
-            let mut git = self.checkout().command("git");
-            git.args(["-c", "user.name=x", "-c", "user.email=x@localhost"]);
-            assert!(git.args(args).status().unwrap().success());
         }
 
         fn measure(&self, [base, head]: [&str; 2], rest: &[&str]) -> Result<[PathBuf; 2], Failure> {

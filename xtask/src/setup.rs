@@ -1,6 +1,7 @@
 //! Sets up what every command needs. Each step does nothing if nothing is missing.
 
 use std::path::{Path, PathBuf};
+use std::process::Command;
 
 use gleaner_base::Failure;
 
@@ -41,7 +42,7 @@ pub(crate) const PROGRAMS: [&str; 11] = [
     "gleaner-supervisor",
 ];
 
-/// Sets up the wasm target, `.venv`, the programs, and these lambdas.
+/// Sets up the wasm target, `.venv`, all programs, and these lambdas.
 pub(crate) fn run(
     checkout: &Checkout,
     steps: &mut Steps,
@@ -50,16 +51,8 @@ pub(crate) fn run(
     run_with(checkout, steps, lambdas, programs)
 }
 
-/// Sets up the same, but only the programs that a replay needs.
-pub(crate) fn run_for_replays(
-    checkout: &Checkout,
-    steps: &mut Steps,
-    lambdas: &[PathBuf],
-) -> Result<(), Failure> {
-    run_with(checkout, steps, lambdas, replay_programs)
-}
-
-fn run_with(
+/// Sets up the same, with the programs that `programs` builds.
+pub(crate) fn run_with(
     checkout: &Checkout,
     steps: &mut Steps,
     lambdas: &[PathBuf],
@@ -78,11 +71,8 @@ fn run_with(
 /// Installs Rust's libraries for `target`.
 pub(crate) fn target(checkout: &Checkout, target: &str) -> Result<(), Failure> {
     // The compiler is queried, since it need not come from rustup.
-    let rustc = std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into());
-    let mut rustc = checkout.command(rustc);
-    rustc.args(["--print", "target-libdir", "--target", target]);
-    let libraries = steps::output(&mut rustc, "install Rust with rustup")?;
-    if Path::new(libraries.trim()).is_dir() {
+    let libraries = rustc(checkout, &["--print", "target-libdir", "--target", target])?;
+    if Path::new(&libraries).is_dir() {
         return Ok(());
     }
     let mut add = checkout.command("rustup");
@@ -92,6 +82,13 @@ pub(crate) fn target(checkout: &Checkout, target: &str) -> Result<(), Failure> {
          package"
     );
     steps::run(&mut add, &help)
+}
+
+/// Returns the text that the compiler prints.
+pub(crate) fn rustc(checkout: &Checkout, arguments: &[&str]) -> Result<String, Failure> {
+    let rustc = std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into());
+    let mut rustc = checkout.command(rustc);
+    Ok(steps::output(rustc.args(arguments), "install Rust with rustup")?.trim().to_owned())
 }
 
 /// Builds all programs in one call, even those that a command does not need: shared crates then
@@ -132,13 +129,20 @@ fn build(checkout: &Checkout, packages: &[&str], programs: &[&str]) -> Result<()
     )
 }
 
-/// Builds a program that is not installed.
-pub(crate) fn binary(checkout: &Checkout, name: &str) -> Result<(), Failure> {
-    let mut build = checkout.cargo();
-    // Only the binary is named: cargo selects features by the named packages, and other features
-    // would compile dependencies twice.
-    build.args(["build", "--release", "--bin", name]);
-    steps::run(&mut build, "see the first error above")
+/// Builds these programs. No package is named: cargo selects features by the named packages, and
+/// other features would compile dependencies twice.
+pub(crate) fn binaries(checkout: &Checkout, names: &[&str]) -> Result<(), Failure> {
+    build(checkout, &[], names)
+}
+
+/// Returns the command that tests the bindings of the Rust SDK, which a test in `tests/bindings`
+/// generates and compares; with `GLEANER_BLESS` it writes them.
+pub(crate) fn test_bindings(checkout: &Checkout) -> Command {
+    let mut test = checkout.cargo();
+    // The generator runs for a second, so it is not optimized.
+    test.args(["test", "--profile", "xtask", "--package", "gleaner-bindings"]);
+    test.args(["--features", "generator"]);
+    test
 }
 
 pub(crate) fn build_lambdas(checkout: &Checkout, folders: &[PathBuf]) -> Result<(), Failure> {

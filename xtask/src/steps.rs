@@ -1,12 +1,15 @@
 //! Runs the steps of a command: prints each one before it begins, and the seconds that it took,
 //! shows the output of its tool, and gives help if it fails.
 
+use std::ffi::OsString;
+use std::fs;
 use std::io::{self, Write};
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
 use std::time::Instant;
 
 use gleaner_base::{Exit, Failure};
+use serde::de::DeserializeOwned;
 
 use crate::checkout::Checkout;
 
@@ -41,8 +44,8 @@ impl Steps {
     }
 }
 
-/// Returns the failure of an access to a file.
-pub(crate) fn cannot(action: &str, path: &Path, error: &io::Error) -> Failure {
+/// Returns the failure of an access to a file, or of its content.
+pub(crate) fn cannot(action: &str, path: &Path, error: &impl std::error::Error) -> Failure {
     Failure::caused_by(Exit::Internal, format!("cannot {action} `{}`", path.display()), error)
 }
 
@@ -59,6 +62,64 @@ pub(crate) fn run(command: &mut Command, help: &str) -> Result<(), Failure> {
 /// that what needs it can be skipped.
 pub(crate) fn download(command: &mut Command, help: &str) -> Result<(), Failure> {
     run(command, help).map_err(|failure| Failure { exit: Exit::Unreachable, ..failure })
+}
+
+/// Writes a file, and creates the folders above it.
+pub(crate) fn write_file(file: &Path, text: &str) -> Result<(), Failure> {
+    make_folder(file.parent().unwrap_or(file))?;
+    fs::write(file, text).map_err(|error| cannot("write", file, &error))
+}
+
+/// Creates a folder with those above it.
+pub(crate) fn make_folder(folder: &Path) -> Result<(), Failure> {
+    fs::create_dir_all(folder).map_err(|error| cannot("create", folder, &error))
+}
+
+/// Removes a folder, if there is one.
+pub(crate) fn remove_folder(folder: &Path) -> Result<(), Failure> {
+    match fs::remove_dir_all(folder) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => {
+            Err(cannot("remove", folder, &error))
+        }
+        _ => Ok(()),
+    }
+}
+
+pub(crate) fn copy_files(from: &Path, to: &Path) -> io::Result<()> {
+    fs::create_dir_all(to)?;
+    for entry in fs::read_dir(from)? {
+        let entry = entry?;
+        let target = to.join(entry.file_name());
+        if entry.file_type()?.is_dir() {
+            copy_files(&entry.path(), &target)?;
+        } else {
+            fs::copy(entry.path(), target)?;
+        }
+    }
+    Ok(())
+}
+
+/// Returns whether the arguments of `command` are `flag`; all others are refused.
+pub(crate) fn has_flag(command: &str, flag: &str, arguments: &[OsString]) -> Result<bool, Failure> {
+    match arguments {
+        [] => Ok(false),
+        [one] if one == flag => Ok(true),
+        _ => {
+            let message = format!("`cargo xtask {command}` takes `{flag}` or nothing");
+            Err(Failure::new(Exit::Usage, message))
+        }
+    }
+}
+
+/// Checks that tools run; each is named with its package.
+pub(crate) fn require(checkout: &Checkout, tools: &[(&str, &str)]) -> Result<(), Failure> {
+    for (tool, package) in tools {
+        if !succeeds(checkout.command(tool).arg("--version")) {
+            return Err(Failure::new(Exit::Unreachable, format!("`{tool}` is missing"))
+                .with_help(format!("on Debian and Ubuntu, as root: apt-get install {package}")));
+        }
+    }
+    Ok(())
 }
 
 /// Installs packages of Debian or Ubuntu, as root.
@@ -80,6 +141,13 @@ pub(crate) fn output(command: &mut Command, help: &str) -> Result<String, Failur
     } else {
         Err(ended(command, &status.to_string(), help))
     }
+}
+
+/// Parses the JSON that `source` has printed.
+pub(crate) fn parsed<T: DeserializeOwned>(json: &str, source: &str) -> Result<T, Failure> {
+    serde_json::from_str(json).map_err(|error| {
+        Failure::caused_by(Exit::Internal, format!("`{source}` gave no result"), &error)
+    })
 }
 
 /// Runs `command` silently; returns whether it succeeded. False if the program is missing.

@@ -7,11 +7,11 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use gleaner_base::{Exit, Failure};
+use gleaner_base::Failure;
 use gleaner_parts::Parts;
 
 use crate::checkout::Checkout;
-use crate::steps::{download, run, succeeds};
+use crate::steps::{self, cannot, download, run, succeeds};
 
 /// Packages for lambdas: name in pip, and name of the module.
 const PACKAGES: [(&str, &str); 1] = [("numpy", "numpy")];
@@ -31,6 +31,10 @@ const FOR_TESTS: [(&str, &str); 10] = [
     ("openapi-spec-validator", "openapi_spec_validator"),
 ];
 
+/// File in an environment of its own with its packages, written when all are installed. Those of
+/// another version of this program may be others.
+const LIST: &str = "packages.txt";
+
 /// The way out of a download that failed.
 pub(crate) const NETWORK: &str = "check the network, or configure a mirror for pip";
 
@@ -44,20 +48,8 @@ pub(crate) fn set_up(checkout: &Checkout) -> Result<(), Failure> {
         let folder = checkout.path(".venv");
         if folder.exists() {
             println!("creating it again: its Python does not run");
-            fs::remove_dir_all(&folder).map_err(|error| {
-                Failure::caused_by(
-                    Exit::Internal,
-                    format!("cannot remove `{}`", folder.display()),
-                    &error,
-                )
-            })?;
         }
-        // Found as for a lambda. `.venv` would come first, but does not exist here.
-        let interpreter = Parts::find()?.python(None)?;
-        println!("created by {}", interpreter.display());
-        let mut make = checkout.command(interpreter);
-        make.args(["-m", "venv"]).arg(folder);
-        run(&mut make, "set GLEANER_PYTHON to a Python 3.9 or newer with venv and ensurepip")?;
+        make(checkout, &folder)?;
     }
     fetch(checkout, &PACKAGES)
 }
@@ -67,24 +59,46 @@ pub(crate) fn set_up_for_tests(checkout: &Checkout) -> Result<(), Failure> {
     if has(checkout, &FOR_TESTS) { Ok(()) } else { fetch(checkout, &FOR_TESTS) }
 }
 
-/// Makes an environment of its own in `folder`, with packages that lambdas do not need: name in
-/// pip, and name of the module. Returns its Python.
+/// Makes an environment of its own in `folder`, with packages that lambdas do not need, some of
+/// them with versions. Returns its Python.
 pub(crate) fn apart(
     checkout: &Checkout,
     folder: &Path,
-    packages: &[(&str, &str)],
+    packages: &[&str],
 ) -> Result<PathBuf, Failure> {
     let python = folder.join("bin/python3");
-    let modules: Vec<_> = packages.iter().map(|(_, module)| *module).collect();
-    let import = format!("import {}", modules.join(", "));
-    if !succeeds(checkout.command(&python).args(["-I", "-c", &import])) {
-        let mut make = checkout.command(Parts::find()?.python(None)?);
-        make.args(["-m", "venv", "--clear"]).arg(folder);
-        run(&mut make, "set GLEANER_PYTHON to a Python 3.9 or newer with venv and ensurepip")?;
-        let packages: Vec<_> = packages.iter().map(|(package, _)| *package).collect();
-        pip(checkout.command(&python), &packages, NETWORK)?;
+    if !is_made_of(checkout, folder, packages) {
+        // What is there may serve, without a network.
+        if !has_pip(checkout, folder) {
+            make(checkout, folder)?;
+        }
+        pip(checkout.command(&python), packages, NETWORK)?;
+        let list = folder.join(LIST);
+        fs::write(&list, packages.join("\n")).map_err(|error| cannot("write", &list, &error))?;
     }
     Ok(python)
+}
+
+/// Returns whether the environment in `folder` runs, and was completed with just these packages.
+fn is_made_of(checkout: &Checkout, folder: &Path, packages: &[&str]) -> bool {
+    let list = fs::read_to_string(folder.join(LIST));
+    list.is_ok_and(|list| list == packages.join("\n")) && has_pip(checkout, folder)
+}
+
+fn has_pip(checkout: &Checkout, folder: &Path) -> bool {
+    let mut python = checkout.command(folder.join("bin/python3"));
+    succeeds(python.args(["-I", "-c", "import pip"]))
+}
+
+/// Makes an environment without packages, in place of that in `folder`.
+fn make(checkout: &Checkout, folder: &Path) -> Result<(), Failure> {
+    steps::remove_folder(folder)?;
+    // Found as for a lambda: that of `.venv` comes first, unless it is what is made again.
+    let interpreter = Parts::find()?.python(None)?;
+    println!("created by {}", interpreter.display());
+    let mut make = checkout.command(interpreter);
+    make.args(["-m", "venv"]).arg(folder);
+    run(&mut make, "set GLEANER_PYTHON to a Python 3.9 or newer with venv and ensurepip")
 }
 
 /// A command that runs `code` with the environment's Python.
@@ -108,4 +122,25 @@ fn fetch(checkout: &Checkout, packages: &[(&str, &str)]) -> Result<(), Failure> 
 pub(crate) fn pip(mut python: Command, packages: &[&str], help: &str) -> Result<(), Failure> {
     python.args(["-m", "pip", "install", "--disable-pip-version-check", "-q"]).args(packages);
     download(&mut python, &format!("pip fetches {}: {help}", packages.join(", ")))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::test_folder::TestFolder;
+
+    #[test]
+    fn an_environment_of_other_versions_is_made_again() {
+        let folder = TestFolder::new();
+        let checkout = Checkout::with_cargo(folder.root().to_owned(), "cargo".into());
+        let is_made_of = |packages: &[&str]| is_made_of(&checkout, folder.root(), packages);
+        folder.write_program("bin/python3", "#!/bin/sh\nexit 0\n");
+        // pip was interrupted.
+        assert!(!is_made_of(&["onnx==1.23.2", "numpy"]));
+        folder.write(LIST, "onnx==1.23.2\nnumpy");
+        assert!(is_made_of(&["onnx==1.23.2", "numpy"]));
+        assert!(!is_made_of(&["onnx==1.24.0", "numpy"]));
+        folder.write_program("bin/python3", "#!/bin/sh\nexit 1\n");
+        assert!(!is_made_of(&["onnx==1.23.2", "numpy"]));
+    }
 }

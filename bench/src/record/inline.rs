@@ -18,7 +18,7 @@ use super::{FRAMES_PER_S, TYPE, Traffic, header};
 
 const PREROLL_BYTES: u64 = 64 << 20;
 
-/// RecorderLoad that the recorder causes.
+/// Load that the recorder causes.
 pub struct RecorderLoad {
     /// Received MB/s.
     pub megabytes_per_s: f64,

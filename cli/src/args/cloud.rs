@@ -87,7 +87,11 @@ pub enum UsersCommand {
     /// Add a user, or invite one again, and show the code for `gleaner login`
     Invite(UserArgs),
     /// Remove a user, whose tokens end at once
-    Remove(RemoveArgs),
+    Remove {
+        /// Name of the user
+        #[arg(value_name = "NAME", value_parser = name)]
+        name: String,
+    },
 }
 
 /// Arguments of `gleaner users invite`.
@@ -99,14 +103,6 @@ pub struct UserArgs {
     /// The rights: viewer, operator, deployer or admin; each has those of the ones before
     #[arg(long, value_name = "ROLE")]
     pub role: Role,
-}
-
-/// Arguments of `gleaner users remove`.
-#[derive(Args, Debug)]
-pub struct RemoveArgs {
-    /// Name of the user
-    #[arg(value_name = "NAME", value_parser = name)]
-    pub name: String,
 }
 
 /// Arguments of `gleaner tokens`.

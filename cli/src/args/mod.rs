@@ -22,8 +22,8 @@ pub use clips::{
 };
 pub use cloud::{
     AuditArgs, CloudCommand, EnrolArgs, ListArgs, LoginArgs, NewTokenArgs, NewVehicleArgs,
-    RemoveArgs, RemoveTokenArgs, SearchArgs, TokensArgs, TokensCommand, UnenrolArgs, UserArgs,
-    UsersArgs, UsersCommand, VehiclesArgs, VehiclesCommand,
+    RemoveTokenArgs, SearchArgs, TokensArgs, TokensCommand, UnenrolArgs, UserArgs, UsersArgs,
+    UsersCommand, VehiclesArgs, VehiclesCommand,
 };
 pub use signing::{KeysArgs, KeysCommand, PublishArgs, SignArgs};
 pub use vehicle::{
@@ -35,7 +35,7 @@ pub use waves::{FleetArgs, FleetCommand, WaveArgs};
 
 /// Run small functions (lambdas) next to the sensors of a vehicle, and keep the data worth keeping
 #[derive(Parser, Debug)]
-#[command(name = "gleaner", version, propagate_version = true)]
+#[command(name = "gleaner", version = gleaner_base::version(), propagate_version = true)]
 pub struct Cli {
     /// The command
     #[command(subcommand)]
@@ -67,7 +67,7 @@ pub enum CliCommand {
     /// Exits with 0 if the decisions are identical, and with 4 if they differ.
     Diff(DiffArgs),
     /// Build and replay a lambda on each save of a source, and show changed decisions
-    Dev(DevArgs),
+    Dev(ReplayedArgs),
     /// Repeat the decisions of a clip, and compare them with its journal
     ///
     /// Exits with 0 if all are identical, and with 4 at the first difference; with --trust, with 3
@@ -320,9 +320,9 @@ pub struct CheckArgs {
     pub json: bool,
 }
 
-/// Arguments of `gleaner replay`.
+/// A lambda, drives and the part of them to replay.
 #[derive(Args, Clone, Debug)]
-pub struct ReplayArgs {
+pub struct ReplayedArgs {
     #[command(flatten)]
     #[allow(missing_docs)]
     pub target: LambdaArgs,
@@ -343,12 +343,27 @@ pub struct ReplayArgs {
     /// Result folder [default: DIR/out]
     #[arg(long)]
     pub out: Option<PathBuf>,
+    /// Do not record the clips of the manifest's table `record`, which makes a replay faster
+    #[arg(long)]
+    pub no_record: bool,
+}
+
+impl ReplayedArgs {
+    /// Returns the result folder.
+    pub(crate) fn out(&self) -> PathBuf {
+        self.out.clone().unwrap_or_else(|| self.target.lambda.join("out"))
+    }
+}
+
+/// Arguments of `gleaner replay`.
+#[derive(Args, Clone, Debug)]
+pub struct ReplayArgs {
+    #[command(flatten)]
+    #[allow(missing_docs)]
+    pub replayed: ReplayedArgs,
     /// Write every decision, not only those with a trigger or a fault
     #[arg(long)]
     pub all: bool,
-    /// Do not record the clips of the manifest's table `record`
-    #[arg(long)]
-    pub no_record: bool,
     /// Record these topics of the drive instead of those of the table `record`, as in '*' or
     /// '/camera/*'
     #[arg(long, value_name = "PATTERN", conflicts_with_all = ["no_record", "verify"])]
@@ -394,32 +409,6 @@ pub struct DiffArgs {
     /// Write a report page of both runs with their differences
     #[arg(long, value_name = "FILE")]
     pub report: Option<PathBuf>,
-}
-
-/// Arguments of `gleaner dev`.
-#[derive(Args, Debug)]
-pub struct DevArgs {
-    #[command(flatten)]
-    #[allow(missing_docs)]
-    pub target: LambdaArgs,
-    /// MCAP files, rosbag2 .db3 files and directories, as for `gleaner replay`
-    #[arg(value_name = "DRIVE", required = true)]
-    pub drives: Vec<PathBuf>,
-    /// Merge all files by time, even if they are separate drives
-    #[arg(long)]
-    pub merge: bool,
-    /// Start at this time, as in `gleaner replay`
-    #[arg(long, value_name = "TIME", value_parser = drive_time)]
-    pub from: Option<String>,
-    /// Stop before this time
-    #[arg(long, value_name = "TIME", value_parser = drive_time)]
-    pub to: Option<String>,
-    /// Result folder [default: DIR/out]
-    #[arg(long)]
-    pub out: Option<PathBuf>,
-    /// Do not record the clips of the manifest's table `record`, which makes a replay faster
-    #[arg(long)]
-    pub no_record: bool,
 }
 
 /// Bounds of `--rate`: beyond, a drive of an hour takes longer than a day, or is over at once.

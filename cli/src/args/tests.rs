@@ -19,8 +19,8 @@ fn a_value_may_begin_with_a_minus_and_hold_an_equals_sign() {
     let args =
         replay(&["dir", "a.mcap", "--set", "brake_mps2=-1.4", "--set", "word=a=b", "b.mcap"])
             .unwrap();
-    assert_eq!(args.target.set, ["brake_mps2=-1.4", "word=a=b"]);
-    assert_eq!(args.drives, [PathBuf::from("a.mcap"), PathBuf::from("b.mcap")]);
+    assert_eq!(args.replayed.target.set, ["brake_mps2=-1.4", "word=a=b"]);
+    assert_eq!(args.replayed.drives, [PathBuf::from("a.mcap"), PathBuf::from("b.mcap")]);
 }
 
 #[test]

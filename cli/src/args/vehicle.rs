@@ -3,9 +3,9 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use clap::{Args, Subcommand};
+use clap::{Args, Subcommand, value_parser};
 use gleaner_base::parse_duration;
-use gleaner_trust::VehicleName;
+use gleaner_trust::{COUNTER_MAX, VehicleName};
 
 use super::WaveArgs;
 
@@ -51,7 +51,7 @@ pub struct DeployArgs {
     pub id: Option<String>,
     /// Number of the release, higher than all before [default: the next one after the signed
     /// deployment before]
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = value_parser!(u64).range(1..=COUNTER_MAX))]
     pub release: Option<u64>,
     /// Override a key of the config table, as in brake_mps2=-1.4
     #[arg(long, value_name = "KEY=VALUE", value_parser = super::assignment)]
@@ -60,7 +60,7 @@ pub struct DeployArgs {
     #[arg(long, visible_alias = "selector", value_name = "NAME=VALUE", value_parser = super::assignment)]
     pub label: Vec<String>,
     /// Digest of the revision that runs if this one fails, or `none` [default: the one of the
-    /// deployment before, or the fallback of that if it has failed]
+    /// deployment before; if that has failed, its fallback, or none]
     #[arg(long, value_name = "SHA256")]
     pub fallback: Option<String>,
     /// The trust root with the keys of other deployers, of whom one may have signed the deployment
@@ -69,7 +69,7 @@ pub struct DeployArgs {
     pub trust: Option<PathBuf>,
     /// Deploy without a question, also if that takes the deployment away from vehicles, or none has
     /// the labels
-    #[arg(long, requires = "fleet")]
+    #[arg(long, requires = "fleet", conflicts_with = "local")]
     pub yes: bool,
     /// Time after which a vehicle no longer accepts the deployment for the first time
     #[arg(long, value_name = "DURATION", default_value = "90d", value_parser = days)]
@@ -105,7 +105,7 @@ pub struct ChangeArgs {
     pub vehicle: VehicleArgs,
 }
 
-/// Arguments of `gleaner status`.
+/// Arguments of `gleaner status`, and of other commands that read from a vehicle.
 #[derive(Args, Debug)]
 pub struct StatusArgs {
     /// The vehicle
@@ -124,10 +124,7 @@ pub struct TopArgs {
     pub once: bool,
     /// The vehicle
     #[command(flatten)]
-    pub on: OnArgs,
-    /// The orchestrator
-    #[command(flatten)]
-    pub vehicle: VehicleArgs,
+    pub source: StatusArgs,
 }
 
 /// Arguments of `gleaner logs` and `gleaner events`.
@@ -141,10 +138,7 @@ pub struct StreamArgs {
     pub last: usize,
     /// The vehicle
     #[command(flatten)]
-    pub on: OnArgs,
-    /// The orchestrator
-    #[command(flatten)]
-    pub vehicle: VehicleArgs,
+    pub source: StatusArgs,
 }
 
 /// Arguments of `gleaner logs`.

@@ -12,7 +12,7 @@ pub struct WaveArgs {
     /// Share of the vehicles that a wave reaches, as in 5%; once for each wave, a last one reaches
     /// all
     #[arg(long, visible_alias = "canary", value_name = "PERCENT", value_parser = percent,
-        requires = "fleet")]
+        requires = "fleet", conflicts_with = "local")]
     pub wave: Vec<u8>,
     /// Share of a wave's vehicles that must run it before the next one opens
     #[arg(long, value_name = "PERCENT", value_parser = percent, default_value = "95%", requires = "wave")]

@@ -14,7 +14,6 @@ use serde_json::Value;
 use super::error::{BuildError, TARGET};
 use super::sandbox::Sandbox;
 
-/// Cargo's variable for stripping a component.
 const STRIP: &str = "CARGO_PROFILE_RELEASE_STRIP";
 
 /// Enables 128-bit SIMD, which every host supports: kernels of the SDK are several times slower
@@ -27,7 +26,6 @@ pub(super) struct Compiled {
     pub(super) opened: io::Result<PlainFile>,
 }
 
-/// Compiles the package in `dir`, if `sandboxed` in a sandbox.
 pub(super) fn compile(dir: &Path, sandboxed: bool) -> Result<Compiled, BuildError> {
     let package = dir.join("Cargo.toml");
     if !package.is_file() {

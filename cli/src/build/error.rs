@@ -13,7 +13,6 @@ use gleaner_wheels::WheelError;
 
 use super::requirements::RefusedLine;
 
-/// Errors of building a lambda.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum BuildError {
     #[error(
@@ -79,7 +78,6 @@ pub(super) enum BuildError {
     Layout(#[source] LayoutError),
 }
 
-/// Compilation target of a component.
 pub(super) const TARGET: &str = "wasm32-wasip2";
 
 /// Returns a function that makes an error of `action` on `path`.
@@ -93,80 +91,71 @@ pub(super) fn failed(
 
 impl Explain for BuildError {
     fn help(&self) -> Option<String> {
-        Some(match self {
+        let help = match self {
             BuildError::EntryName { kind: LambdaKind::Wasm, .. } => {
-                "write entry = \"NAME.wasm\", or kind = \"python\"".to_owned()
+                "write entry = \"NAME.wasm\", or kind = \"python\""
             }
-            BuildError::EntryName { .. } => {
-                "write entry = \"main.py\", or kind = \"wasm\"".to_owned()
-            }
+            BuildError::EntryName { .. } => "write entry = \"main.py\", or kind = \"wasm\"",
             BuildError::Missing { named_by, .. } => {
-                format!("create the file, or correct {named_by} in lambda.toml")
+                return Some(format!("create the file, or correct {named_by} in lambda.toml"));
             }
             BuildError::NoPackage { .. } => {
                 "kind = \"wasm\" needs a Rust package: create one with `cargo init --lib`; \
                  for Python write kind = \"python\""
-                    .to_owned()
             }
             BuildError::NoCargo { .. } => {
-                "install Rust with rustup, or set CARGO to the cargo to use".to_owned()
+                "install Rust with rustup, or set CARGO to the cargo to use"
             }
-            BuildError::NoTarget => format!("run `rustup target add {TARGET}`"),
+            BuildError::NoTarget => return Some(format!("run `rustup target add {TARGET}`")),
             BuildError::NoComponent { .. } => {
-                "write crate-type = [\"cdylib\", \"rlib\"] below [lib] in its Cargo.toml".to_owned()
+                "write crate-type = [\"cdylib\", \"rlib\"] below [lib] in its Cargo.toml"
             }
             BuildError::Changed { .. } => {
                 "it was changed during the build: build again; if its date is in the future, \
                  `touch` it first"
-                    .to_owned()
             }
-            BuildError::TooMuch => {
-                "move data that the lambda does not need out of its folder".to_owned()
-            }
+            BuildError::TooMuch => "move data that the lambda does not need out of its folder",
             BuildError::File { source, .. } => return NotPlain::of(source).map(NotPlain::help),
             BuildError::CompileSandboxed { .. } => {
                 "if a build script or a macro was denied an access: the layer `files` lets it read \
                  the toolchain, crates and its workspace, and write its target folder; the layer \
                  `sockets` lets it open none. Remove that access, or build without --sandboxed if \
                  you trust the author"
-                    .to_owned()
             }
             BuildError::Workspace { .. } => {
-                "move the lambda into its own folder outside of the workspace".to_owned()
+                "move the lambda into its own folder outside of the workspace"
             }
-            BuildError::NoHome => "set HOME to an absolute path".to_owned(),
+            BuildError::NoHome => "set HOME to an absolute path",
             BuildError::Toolchain { .. } => {
-                "remove the rust-toolchain.toml that names it, or set RUSTUP_TOOLCHAIN".to_owned()
+                "remove the rust-toolchain.toml that names it, or set RUSTUP_TOOLCHAIN"
             }
             BuildError::Parts(error) => return error.help(),
             BuildError::Wheel(error) => return error.help(),
             BuildError::Platform { .. } => {
                 "write the version of its glibc and its processor: --python-platform \
                  manylinux_2_28_aarch64; `ldd --version` on the vehicle shows that of its glibc"
-                    .to_owned()
             }
             BuildError::Requirement { .. } => {
                 "write NAME==VERSION --hash=sha256:HEX, as `pip-compile --generate-hashes` and `uv \
                  pip compile --generate-hashes` do; an index is a setting of the user who builds: \
                  PIP_INDEX_URL"
-                    .to_owned()
             }
             BuildError::Fetched { .. } => {
                 "its messages are above; only wheels are used. Without pip: install python3-pip, \
                  or name a Python that has it: GLEANER_PYTHON"
-                    .to_owned()
             }
-            BuildError::Unlocked { .. } => "lock its hashes again, and build again".to_owned(),
+            BuildError::Unlocked { .. } => "lock its hashes again, and build again",
             BuildError::NoNumpy { .. } => {
                 "add numpy to the requirements, and lock them again; packages of the vehicle are \
                  not visible to a lambda with wheels"
-                    .to_owned()
             }
-            BuildError::NoSandbox | BuildError::Fetch { .. } => return None,
             BuildError::Manifest(error) => return error.help(),
             BuildError::Sources(error) | BuildError::Layout(error) => return error.help(),
-            BuildError::Compile { .. } => return None,
-        })
+            BuildError::NoSandbox | BuildError::Fetch { .. } | BuildError::Compile { .. } => {
+                return None;
+            }
+        };
+        Some(help.to_owned())
     }
 
     fn exit(&self) -> Exit {

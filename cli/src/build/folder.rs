@@ -11,6 +11,7 @@ use gleaner_lambda::layout::{BUILD_MAX, FILES_MAX};
 use gleaner_lambda::{BuildDir, Manifest};
 
 use super::error::{BuildError, failed};
+use crate::remove_folder;
 
 /// An unfinished build, in a folder beside the old one. The folder is hidden, so that its files do
 /// not count as sources if this process is killed. Dropping it before [`finish`](Self::finish)
@@ -61,7 +62,6 @@ impl PartialBuild {
         &self.path
     }
 
-    /// Counts a file.
     pub(super) fn count(&mut self, bytes: u64) -> Result<(), BuildError> {
         self.built.files += 1;
         self.built.bytes = self.built.bytes.saturating_add(bytes);
@@ -114,10 +114,5 @@ impl Drop for PartialBuild {
 }
 
 fn remove(folder: &Path) -> Result<(), BuildError> {
-    match fs::remove_dir_all(folder) {
-        Err(error) if error.kind() != io::ErrorKind::NotFound => {
-            Err(failed("remove", folder)(error))
-        }
-        _ => Ok(()),
-    }
+    remove_folder(folder).map_err(failed("remove", folder))
 }

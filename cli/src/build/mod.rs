@@ -22,15 +22,14 @@ use gleaner_base::{ByteSize, Exit, Failure, PlainFile, excerpt};
 use gleaner_lambda::layout::FILE_MAX;
 use gleaner_lambda::manifest::LambdaKind;
 use gleaner_lambda::{BuildDir, LayoutError, Manifest, SOURCE_MAX, Sources};
-use gleaner_report::format::size;
+use gleaner_report::format::{counted, size};
 
 use error::BuildError;
 use folder::{Built, PartialBuild};
 
 use crate::args::BuildArgs;
-use crate::stdout::print;
+use crate::output::print;
 
-/// Builds a lambda and prints a summary.
 pub(crate) fn run(args: &BuildArgs) -> Result<Exit, Failure> {
     let dir = &*args.lambda;
     // A source that is changed during the build is then newer than the build.
@@ -42,8 +41,7 @@ pub(crate) fn run(args: &BuildArgs) -> Result<Exit, Failure> {
             &error,
         )
     })?;
-    let (path, files) = (BuildDir::of(dir), built.files);
-    let files = if files == 1 { "1 file".to_owned() } else { format!("{files} files") };
+    let (path, files) = (BuildDir::of(dir), counted(built.files, "file"));
     print(&format!(
         "built {} ({files}, {})\n{}{}{}",
         path.path().display(),
@@ -102,12 +100,10 @@ fn note(manifest: &Manifest) -> String {
     let topics = unrecorded.map(|topic| format!("`{topic}`")).collect::<Vec<_>>().join(", ");
     match topics.is_empty() {
         true => String::new(),
-        false => {
-            format!(
-                "note: [record] lacks {topics}, which the lambda reads: its clips cannot be \
-                 verified alone\n"
-            )
-        }
+        false => format!(
+            "note: [record] lacks {topics}, which the lambda reads: its clips cannot be verified \
+             alone\n"
+        ),
     }
 }
 

@@ -30,7 +30,6 @@ const NOWHERE: &str = "/dev/null/target";
 /// Readable parts of cargo's home: crates and the configuration of registries, but no credentials.
 const CARGO_HOME_PARTS: [&str; 4] = ["registry", "git", "config.toml", "config"];
 
-/// Settings for compiling a package in the sandbox.
 pub(super) struct Sandbox {
     shim: PathBuf,
     sysroot: PathBuf,
@@ -82,7 +81,6 @@ impl Sandbox {
         Ok(Self { shim, sysroot, cargo_home, workspace: workspace_root, target })
     }
 
-    /// Returns the folder that the build writes to.
     pub(super) fn target(&self) -> &Path {
         &self.target
     }
@@ -190,7 +188,6 @@ fn fetch(sysroot: &Path, package: &Path) -> Result<(), BuildError> {
     if status.success() { Ok(()) } else { Err(BuildError::Fetch { status }) }
 }
 
-/// Runs `command` and returns the line that it prints.
 fn first_line(command: &mut Command) -> io::Result<String> {
     let output = command.stdin(Stdio::null()).stderr(Stdio::null()).output()?;
     let line = String::from_utf8_lossy(&output.stdout).trim().to_owned();

@@ -8,7 +8,6 @@ use super::*;
 
 const PYTHON: &str = "lambda = { name = 'x', version = '0.1.0', kind = 'python', entry = 'main.py' }\nschedule.period = '1s'\n";
 
-/// A lambda's folder, removed when the test ends.
 struct LambdaFolder(TempDir);
 
 impl LambdaFolder {

@@ -5,18 +5,19 @@
 mod download;
 mod export;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::thread::sleep;
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant};
 
-use gleaner_base::{ByteSize, Exit, Failure, nanoseconds, visible};
+use gleaner_base::{ByteSize, Exit, Failure, visible};
 use gleaner_fleet::clips::{ClipId, ClipPolicy, ClipState, ClipUsage, FleetClip};
 use serde_json::{Value, json};
 
 use self::download::ClipTarget;
 use super::{client, list, show};
 use crate::args::{ClipFilterArgs, ClipsArgs, ClipsCommand, PolicyArgs, PullArgs, RemoveClipsArgs};
-use crate::render::table;
+use crate::output::print_error;
+use crate::render::{or_dash, table};
 
 /// Interval of looks whether a vehicle has sent a clip.
 const INTERVAL: Duration = Duration::from_secs(2);
@@ -71,17 +72,12 @@ fn remove(args: &RemoveClipsArgs) -> Result<Exit, Failure> {
     Err(all)
 }
 
-/// Returns the parts of a query that choose clips.
 fn query(filter: &ClipFilterArgs) -> Vec<(&'static str, String)> {
-    let since = filter.since.map(|since| {
-        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-        nanoseconds(now.saturating_sub(since)).to_string()
-    });
     let values = [
         ("vehicle", filter.vehicle.clone()),
         ("lambda", filter.lambda.clone()),
         ("label", filter.label.clone()),
-        ("from_ns", since),
+        ("from_ns", filter.since.map(list::since)),
     ];
     values.into_iter().filter_map(|(key, value)| Some((key, value?))).collect()
 }
@@ -101,7 +97,6 @@ fn text(clips: &[FleetClip]) -> String {
         labels.sort();
         labels.dedup();
         let scores = facts.moments.iter().filter_map(|it| it.score);
-        let score = scores.reduce(f64::max).map(|score| format!("{score:.2}"));
         let state = match clip.state {
             ClipState::Uploading => {
                 let percent = clip.received * 100 / facts.bytes.max(1);
@@ -115,12 +110,11 @@ fn text(clips: &[FleetClip]) -> String {
             format!("{:.1}s", facts.to_ns.saturating_sub(facts.from_ns) as f64 / 1e9),
             format!("{:.1} MiB", facts.bytes as f64 / (1 << 20) as f64),
             if labels.is_empty() { "-".to_owned() } else { labels.join(", ") },
-            score.unwrap_or_else(|| "-".to_owned()),
+            or_dash(scores.reduce(f64::max), |score| format!("{score:.2}")),
             state,
         ]
     });
-    let rows = std::iter::once(head.map(str::to_owned)).chain(rows);
-    table(rows.collect(), &[2, 3, 5])
+    table(&head, rows, &[2, 3, 5])
 }
 
 fn policy(args: &PolicyArgs) -> Result<Exit, Failure> {
@@ -158,20 +152,18 @@ fn policy(args: &PolicyArgs) -> Result<Exit, Failure> {
 
 fn pull(args: &PullArgs) -> Result<Exit, Failure> {
     let client = client()?;
-    let mut waiting = BTreeMap::new();
-    for id in &args.ids {
-        let clip: FleetClip = client.post(&format!("{}/pull", path(id)), &json!({}))?;
-        waiting.insert(id.clone(), clip);
-    }
+    let ids: BTreeSet<&ClipId> = args.ids.iter().collect();
+    let wanted = ids.iter().map(|id| client.post(&format!("{}/pull", path(id)), &json!({})));
+    let wanted = wanted.collect::<Result<Vec<FleetClip>, _>>()?;
     if args.no_wait {
-        let clips: Vec<_> = waiting.into_values().collect();
-        return show(args.json, &clips, |clips| text(clips));
+        return show(args.json, &wanted, |clips| text(clips));
     }
+    let mut waiting: Vec<(&ClipId, FleetClip)> = ids.into_iter().zip(wanted).collect();
     let until = Instant::now() + args.timeout;
     let mut files: Vec<Value> = Vec::new();
     let mut shown = BTreeMap::new();
     loop {
-        let mut left = BTreeMap::new();
+        let mut left = Vec::new();
         for (id, clip) in waiting {
             match clip.state {
                 ClipState::Stored => {
@@ -182,18 +174,19 @@ fn pull(args: &PullArgs) -> Result<Exit, Failure> {
                 ClipState::Gone | ClipState::Failed => {
                     let reason = clip.reason.as_deref().map(visible).unwrap_or_default();
                     let state = clip.state.as_str();
-                    let mut failure =
-                        Failure::new(Exit::Differs, format!("clip `{id}` cannot be fetched"));
-                    failure.causes = vec![format!("it is {state}: {reason}")];
-                    return Err(failure.with_help("choose another clip: `gleaner clips`"));
+                    let causes = vec![format!("it is {state}: {reason}")];
+                    let message = format!("clip `{id}` cannot be fetched");
+                    return Err(Failure { causes, ..Failure::new(Exit::Differs, message) }
+                        .with_help("choose another clip: `gleaner clips`"));
                 }
                 state => {
                     let progress = (state, clip.received);
-                    if shown.insert(id.clone(), progress) != Some(progress) && !args.json {
+                    if shown.insert(id, progress) != Some(progress) && !args.json {
                         let (received, bytes) = (clip.received, clip.facts.bytes);
-                        eprintln!("{id}: {}, {received} of {bytes} bytes", state.as_str());
+                        let state = state.as_str();
+                        print_error(&format!("{id}: {state}, {received} of {bytes} bytes\n"));
                     }
-                    left.insert(id, clip);
+                    left.push(id);
                 }
             }
         }
@@ -208,11 +201,8 @@ fn pull(args: &PullArgs) -> Result<Exit, Failure> {
             ));
         }
         sleep(INTERVAL);
-        waiting = BTreeMap::new();
-        for id in left.into_keys() {
-            let clip = client.get(&path(&id))?;
-            waiting.insert(id, clip);
-        }
+        let looked = left.into_iter().map(|id| Ok((id, client.get(&path(id))?)));
+        waiting = looked.collect::<Result<_, Failure>>()?;
     }
     show(args.json, &files, |files| {
         let files = files.iter().filter_map(|file| file["file"].as_str());

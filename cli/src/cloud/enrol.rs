@@ -12,10 +12,8 @@ use crate::args::{EnrolArgs, UnenrolArgs};
 use crate::render::Paint;
 use crate::vehicle::{self, VehicleClient};
 
-/// Longest file with an enrolment.
 const FILE_MAX: ByteSize = ByteSize::kib(64);
 
-/// Interval of looks at the status.
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
 
 pub(super) fn enrol(args: &EnrolArgs) -> Result<Exit, Failure> {
@@ -56,8 +54,10 @@ pub(super) fn enrol(args: &EnrolArgs) -> Result<Exit, Failure> {
                 continue;
             }
         };
-        let reason = cloud.and_then(|cloud| cloud.reason);
-        failure.causes = reason.iter().map(|reason| in_one_line(reason)).collect();
+        let (reason, help) = cloud.map(|cloud| (cloud.reason, cloud.help)).unwrap_or_default();
+        // Its help is nearer to the cause.
+        failure.help = help.or(failure.help);
+        failure.causes.extend(reason.map(|reason| in_one_line(&reason)));
         return Err(failure);
     }
 }

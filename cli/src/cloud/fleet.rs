@@ -5,7 +5,6 @@ use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Failure, visible};
 use gleaner_fleet::people::{FleetDeployment, ReportedRelease, VehicleSummary};
-use gleaner_report::format::counted;
 use gleaner_trust::SecretKey;
 use hyper::Method;
 use serde_json::json;
@@ -15,16 +14,12 @@ use super::rollout::{Goal, Rollout};
 use super::{client, list, show, waves};
 use crate::args::{ChangeArgs, DeployArgs, FleetArgs, FleetCommand};
 use crate::render::table;
-use crate::vehicle::{
-    Fallback, Former, LocalRevision, VehicleClient, changes, deployment, named_fallback, path,
-    print_lines,
-};
+use crate::vehicle::{LocalRevision, VehicleClient, labels_in_words, path, short};
 
 /// Time in which a vehicle that has connected reports its labels.
 const LABELS: Duration = Duration::from_secs(2);
 
-/// A change of a deployment.
-#[derive(Clone, Copy, PartialEq)]
+#[derive(Clone, Copy)]
 pub(crate) enum Change {
     Rollback,
     Start,
@@ -55,23 +50,23 @@ fn list(json: bool) -> Result<Exit, Failure> {
         let head =
             ["id", "release", "revision", "selector", "state", "vehicles", "running", "failed"];
         let rows = deployments.iter().map(|it| {
-            let labels = it.selector.iter();
-            let labels =
-                labels.map(|(name, value)| format!("{}={}", visible(name), visible(value)));
-            let selector = labels.collect::<Vec<_>>().join(" ");
+            let selector = labels_in_words(&it.selector);
+            let failed = match it.on_fallback {
+                0 => it.failed.to_string(),
+                count => format!("{}, of which {count} run the fallback", it.failed),
+            };
             [
                 visible(&it.id),
                 it.release.to_string(),
-                visible(&it.revision.chars().take(12).collect::<String>()),
+                short(&it.revision),
                 if selector.is_empty() { "all".to_owned() } else { selector },
                 if it.is_wanted { "wanted" } else { "stopped" }.to_owned(),
                 it.vehicles.to_string(),
                 it.running.to_string(),
-                it.failed.to_string(),
+                failed,
             ]
         });
-        let rows = std::iter::once(head.map(str::to_owned)).chain(rows);
-        let mut text = table(rows.collect(), &[1, 5, 6, 7]);
+        let mut text = table(&head, rows, &[1, 5, 6]);
         for (it, waves) in deployments.iter().filter_map(|it| Some((it, it.waves.as_ref()?))) {
             text += &format!("{}: {}\n", visible(&it.id), waves::in_words(waves));
         }
@@ -85,17 +80,13 @@ pub(crate) fn deploy(args: &DeployArgs) -> Result<Exit, Failure> {
     let client = client()?;
     let id = local.id(args);
     let before = deployments(&client)?.into_iter().find(|it| it.id == id);
-    let of = (&*id, local.lambda());
-    let former = before.as_ref().map(|_| Former::fetch(&client, args, &key, of));
-    let former = former.transpose()?.flatten();
-    // A revision that has failed on a vehicle is no fallback.
-    let failed = before.as_ref().map_or(0, |before| before.failed);
-    let has_failed = failed > 0;
-    let (named, former) = (named_fallback(args)?, former.as_ref());
-    let fallback = Fallback::choose(args, named.as_ref(), (former, has_failed), &local.digest);
-    let labels = args.label.iter().map(|text| text.split_once('=').unwrap_or((text, "")));
+    // Vehicles that the waves have not reached do not have it.
+    let all = |it: &FleetDeployment| it.waves.as_ref().map_or(it.vehicles, |it| it.vehicles);
+    let failed = before.as_ref().map(|before| (before.failed, all(before)));
+    let next = local.next(&client, args, &key, failed)?;
+    let labels = next.deployment.selector.iter();
     let selector: Selector =
-        labels.map(|(name, value)| (name.to_owned(), value.to_owned())).collect();
+        labels.map(|(name, value)| (name.to_string(), value.clone())).collect();
     let before: Vec<&Selector> = before
         .iter()
         .flat_map(|it| std::iter::once(&it.selector).chain(&it.older_selectors))
@@ -106,23 +97,14 @@ pub(crate) fn deploy(args: &DeployArgs) -> Result<Exit, Failure> {
     let is_chosen = |it: &&ReportedRelease| {
         vehicles.iter().any(|vehicle| vehicle.name == it.vehicle && selects(&selector, vehicle))
     };
-    let reported = reported.iter().find(is_chosen);
-    let deployment = deployment(args, &local, &id, (former, fallback), reported)?;
+    next.announce(args, reported.iter().find(is_chosen))?;
     let json = args.vehicle.json;
-    if !json {
-        let mut lines = changes(&deployment, former, fallback);
-        if has_failed && args.fallback.is_none() {
-            lines[0] += &format!(", as the one before failed on {}", counted(failed, "vehicle"));
-        }
-        print_lines(&lines)?;
-    }
     plan.confirm(&id, &selector, (args.yes, json))?;
-    let envelope = local.deploy(&client, args, &deployment, &key)?.envelope;
-    let release = deployment.release;
+    let envelope = local.deploy(&client, args, &next.deployment, &key)?.envelope;
     if args.waves.plan().is_some() && !waves::wait(&client, &id, &envelope, args)? {
         return Ok(Exit::Ok);
     }
-    let goal = Goal::Revision { release };
+    let goal = Goal::Revision { release: next.deployment.release };
     let rollout = Rollout { id, selector, envelope: Some(envelope), goal, plan };
     rollout.wait(&client, json, args.timeout)
 }
@@ -155,29 +137,24 @@ pub(crate) fn change(args: &ChangeArgs, change: Change) -> Result<Exit, Failure>
                 .with_help("`gleaner fleet` lists them")
         })?;
     let vehicles: Vec<VehicleSummary> = list::all(&client, "/v1/vehicles", &[])?;
-    let removal = if change == Change::Remove { "is removed from" } else { "stops on" };
-    let plan = match change {
-        Change::Stop | Change::Remove => {
-            let had: Vec<_> = std::iter::once(&selector).chain(&older_selectors).collect();
-            FleetPlan::of_removal(&vehicles, &had, removal)
-        }
-        Change::Rollback | Change::Start => FleetPlan::default(),
+    let (method, end, goal, removal) = match change {
+        Change::Rollback => (Method::POST, "/rollback", Goal::Fallback, None),
+        Change::Start => (Method::POST, "/start", Goal::Running, None),
+        Change::Stop => (Method::POST, "/stop", Goal::Stopped, Some("stops on")),
+        Change::Remove => (Method::DELETE, "", Goal::Removed, Some("is removed from")),
     };
-    if matches!(change, Change::Stop | Change::Remove) {
+    let mut plan = FleetPlan::default();
+    if let Some(removal) = removal {
+        let had: Vec<_> = std::iter::once(&selector).chain(&older_selectors).collect();
+        plan = FleetPlan::of_removal(&vehicles, &had, removal);
         plan.confirm(&id, &selector, (args.yes, args.vehicle.json))?;
     }
     // What was planned is changed, and nothing that came since.
-    let version = (!version.is_empty()).then_some(version);
-    let post = |change: &str| client.change(Method::POST, &format!("{path}/{change}"), &version);
-    let goal = match change {
-        Change::Rollback => post("rollback").map(|()| Goal::Fallback),
-        Change::Start => post("start").map(|()| Goal::Running),
-        Change::Stop => post("stop").map(|()| Goal::Stopped),
-        Change::Remove => client.change(Method::DELETE, &path, &version).map(|()| Goal::Removed),
-    };
+    let version = Some(&*version).filter(|version| !version.is_empty());
+    client.change(method, &format!("{path}{end}"), version)?;
     // In waves, vehicles run different ones.
     let envelope = Some(envelope).filter(|it| waves.is_none() && !it.is_empty());
-    let rollout = Rollout { id, selector, envelope, goal: goal?, plan };
+    let rollout = Rollout { id, selector, envelope, goal, plan };
     rollout.wait(&client, args.vehicle.json, args.timeout)
 }
 

@@ -1,9 +1,12 @@
 //! Lists of a cloud, which come in parts.
 
-use gleaner_base::{ByteSize, Exit, Failure};
+use std::time::Duration;
+
+use gleaner_base::{ByteSize, Exit, Failure, nanoseconds};
 use gleaner_fleet::people::ListPage;
 use serde::de::DeserializeOwned;
 
+use crate::since_1970;
 use crate::vehicle::VehicleClient;
 
 /// Maximum number of entries in a part, and their number without another choice.
@@ -47,10 +50,7 @@ pub(super) fn first<T: DeserializeOwned>(
         let limits = (limit < PART).then(|| ("limit", limit.to_string()));
         let position = after.take().map(|after: String| ("after", after));
         let own = query.iter().cloned().chain(limits).chain(position);
-        let query: Vec<_> = own.map(|(key, it)| format!("{key}={}", escaped(&it))).collect();
-        let mark = if query.is_empty() { "" } else { "?" };
-        let (part, length): (ListPage<T>, _) =
-            client.get_sized(&format!("{path}{mark}{}", query.join("&")))?;
+        let (part, length): (ListPage<T>, _) = client.get_sized(&with_query(path, own))?;
         bytes += length as u64;
         if bytes > BYTES_MAX.bytes() {
             return Err(endless(path, &format!("it has more than {BYTES_MAX}")));
@@ -70,13 +70,27 @@ pub(super) fn first<T: DeserializeOwned>(
 }
 
 fn endless(path: &str, cause: &str) -> Failure {
-    let mut failure = Failure::new(Exit::Internal, format!("the list `{path}` has no end"));
-    failure.causes = vec![cause.to_owned()];
-    failure.with_help("choose fewer with the options of the command, or check the cloud")
+    let failure = Failure::new(Exit::Internal, format!("the list `{path}` has no end"));
+    Failure { causes: vec![cause.to_owned()], ..failure }
+        .with_help("choose fewer with the options of the command, or check the cloud")
+}
+
+pub(super) fn with_query<'k>(
+    path: &str,
+    query: impl IntoIterator<Item = (&'k str, String)>,
+) -> String {
+    let query = query.into_iter().map(|(key, it)| format!("{key}={}", escaped(&it)));
+    let query = query.collect::<Vec<_>>().join("&");
+    if query.is_empty() { path.to_owned() } else { format!("{path}?{query}") }
+}
+
+/// Returns the time so long before now, in ns since 1970, as a value of a query.
+pub(super) fn since(before: Duration) -> String {
+    nanoseconds(since_1970().saturating_sub(before)).to_string()
 }
 
 /// Escapes a value of a query.
-pub(super) fn escaped(text: &str) -> String {
+fn escaped(text: &str) -> String {
     let escape = |byte: u8| match byte {
         b'a'..=b'z' | b'A'..=b'Z' | b'0'..=b'9' | b'-' | b'.' | b'_' => char::from(byte).into(),
         _ => format!("%{byte:02X}"),

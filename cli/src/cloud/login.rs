@@ -9,6 +9,7 @@ use serde_json::json;
 use super::{date, show};
 use crate::account::{CloudAccount, CloudUrl};
 use crate::args::{ListArgs, LoginArgs};
+use crate::output::print_error;
 use crate::vehicle::VehicleClient;
 
 pub(super) fn login(args: &LoginArgs) -> Result<Exit, Failure> {
@@ -16,7 +17,7 @@ pub(super) fn login(args: &LoginArgs) -> Result<Exit, Failure> {
         Failure::new(Exit::Usage, reason).with_help("the cloud shows its address when it starts")
     })?;
     if let Some(warning) = url.warning() {
-        eprintln!("{warning}");
+        print_error(&format!("{warning}\n"));
     }
     let account = CloudAccount { url: url.clone(), token: String::new() };
     let login = Login { code: args.code.clone().map_or_else(read_code, Ok)? };
@@ -48,23 +49,22 @@ fn read_code() -> Result<String, Failure> {
 }
 
 pub(super) fn logout(args: &ListArgs) -> Result<Exit, Failure> {
-    // A file that cannot be read is removed, too.
-    let account = CloudAccount::stored().unwrap_or(None);
-    let ended = match account {
-        Some(account) => VehicleClient::of_cloud(account)?.delete("/v1/login"),
-        None => Ok(()),
+    let ended = match CloudAccount::stored() {
+        Ok(None) => Ok(()),
+        Ok(Some(account)) => match VehicleClient::of_cloud(account)?.delete("/v1/login") {
+            // The cloud did not know the token any more.
+            Err(failure) if failure.exit == Exit::Denied => Ok(()),
+            ended => ended,
+        },
+        // A file that cannot be used is removed, too.
+        Err(failure) => Err(failure.with_help("`gleaner login` gets another token")),
     };
     let removed = CloudAccount::remove()?;
-    match ended {
-        // The cloud did not know the token any more.
-        Err(failure) if failure.exit == Exit::Denied => {}
-        Err(mut failure) => {
-            let message = "removed the token here, but the cloud accepts it until it expires";
-            failure.causes.insert(0, failure.message);
-            failure.message = message.to_owned();
-            return Err(failure);
-        }
-        Ok(()) => {}
+    if let Err(mut failure) = ended {
+        let message = "removed the token here, but the cloud accepts it until it expires";
+        failure.causes.insert(0, failure.message);
+        failure.message = message.to_owned();
+        return Err(failure);
     }
     show(args.json, &json!({ "removed": removed }), |_| {
         let text = match removed {

@@ -23,13 +23,11 @@ mod vehicles;
 mod waves;
 
 use gleaner_base::{Exit, Failure};
-use serde::Serialize;
 
 use crate::account::CloudAccount;
 use crate::args::CloudCommand;
 use crate::delegate;
-use crate::render::json_line;
-use crate::stdout::print;
+use crate::output::show;
 use crate::vehicle::VehicleClient;
 
 pub(crate) use fleet::{Change, change, deploy};
@@ -57,17 +55,20 @@ fn client() -> Result<VehicleClient, Failure> {
     VehicleClient::of_cloud(CloudAccount::load()?)
 }
 
-/// Prints a result as JSON or as text.
-fn show<T: Serialize>(
-    json: bool,
-    result: &T,
-    text: impl Fn(&T) -> String,
-) -> Result<Exit, Failure> {
-    print(&if json { json_line(result) } else { text(result) })?;
-    Ok(Exit::Ok)
-}
-
 /// Formats a time in s since 1970.
 fn date(seconds: u64) -> String {
     gleaner_base::UtcTime::of(seconds.try_into().unwrap_or(i64::MAX)).to_string()
+}
+
+/// Returns a vehicle that has reported nothing.
+#[cfg(test)]
+fn test_vehicle(
+    name: &str,
+    state: gleaner_fleet::people::VehicleState,
+) -> gleaner_fleet::people::VehicleSummary {
+    let vehicle = serde_json::json!({
+        "name": name, "labels": {}, "state": state, "wanted": 0, "handled": 0, "problems": [],
+        "running": 0, "deployments": 0,
+    });
+    serde_json::from_value(vehicle).unwrap()
 }

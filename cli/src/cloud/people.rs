@@ -17,8 +17,7 @@ pub(super) fn users(args: &UsersArgs) -> Result<Exit, Failure> {
     match &args.command {
         None => show(args.json, &list::all::<User>(&client, "/v1/users", &[])?, |users| {
             let rows = users.iter().map(|user| [visible(&user.name), user.role.to_string()]);
-            let head = ["name", "role"].map(str::to_owned);
-            table(std::iter::once(head).chain(rows).collect(), &[])
+            table(&["name", "role"], rows, &[])
         }),
         Some(UsersCommand::Invite(user)) => {
             let request = NewUser { name: user.name.clone(), role: user.role };
@@ -32,10 +31,10 @@ pub(super) fn users(args: &UsersArgs) -> Result<Exit, Failure> {
                 )
             })
         }
-        Some(UsersCommand::Remove(user)) => {
-            client.delete(&format!("/v1/users/{}", user.name))?;
-            show(args.json, &json!({ "name": user.name, "removed": true }), |_| {
-                format!("removed {}\n", user.name)
+        Some(UsersCommand::Remove { name }) => {
+            client.delete(&format!("/v1/users/{name}"))?;
+            show(args.json, &json!({ "name": name, "removed": true }), |_| {
+                format!("removed {name}\n")
             })
         }
     }
@@ -50,7 +49,6 @@ pub(super) fn audit(args: &AuditArgs) -> Result<Exit, Failure> {
                 [&entry.actor, &entry.action, &entry.subject].map(|text| visible(text));
             [time, actor, action, subject]
         });
-        let head = ["time", "who", "action", "subject"].map(str::to_owned);
-        table(std::iter::once(head).chain(rows).collect(), &[])
+        table(&["time", "who", "action", "subject"], rows, &[])
     })
 }

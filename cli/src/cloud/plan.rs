@@ -1,14 +1,15 @@
 //! The vehicles of a cloud that a change of a deployment concerns, and the question before it.
 
 use std::collections::BTreeMap;
-use std::io::{self, IsTerminal, Write};
+use std::io::{self, IsTerminal};
 
 use gleaner_base::{Exit, Failure, visible};
 use gleaner_fleet::people::{VehicleState, VehicleSummary};
 use gleaner_report::format::counted;
 use serde_json::{Value, json};
 
-use crate::vehicle::print_lines;
+use crate::output::print_error;
+use crate::vehicle::{labels_in_words, print_lines};
 
 /// Maximum number of vehicles of each kind that are named.
 const NAMED_MAX: usize = 20;
@@ -67,7 +68,6 @@ impl FleetPlan {
         Self { removes, removal, ..Self::default() }
     }
 
-    /// Returns whether it concerns any vehicle.
     pub(super) fn matches_any(&self) -> bool {
         self.kinds().iter().any(|(_, names)| !names.is_empty())
     }
@@ -82,7 +82,6 @@ impl FleetPlan {
         self.kinds().iter().any(|(_, names)| names.iter().any(|name| name == vehicle))
     }
 
-    /// Returns it as JSON.
     pub(super) fn json(&self) -> Value {
         json!({ "starts": self.starts, "updates": self.updates, "removes": self.removes })
     }
@@ -135,12 +134,10 @@ impl FleetPlan {
             false => (Exit::Differs, "no vehicle matches"),
             true => (Exit::Usage, "it takes the deployment away from vehicles"),
         };
-        let labels: Vec<_> =
-            selector.iter().map(|(name, value)| format!("{name}={}", visible(value))).collect();
         let mut failure = Failure::new(exit, format!("nothing was changed: {why}"));
         failure.causes = lines;
-        if !self.matches_any() && !labels.is_empty() {
-            failure.causes.push(format!("its labels are {}", labels.join(" ")));
+        if !self.matches_any() && !selector.is_empty() {
+            failure.causes.push(format!("its labels are {}", labels_in_words(selector)));
         }
         Err(failure
             .with_help("`gleaner vehicles` shows all; with `--yes`, it is done all the same"))
@@ -153,8 +150,7 @@ fn is_agreed(lines: &[String]) -> Result<bool, Failure> {
         return Ok(false);
     }
     let failed = |error| Failure::caused_by(Exit::Internal, "cannot ask at the terminal", &error);
-    eprint!("{}\ntype `yes` to go on: ", lines.join("\n"));
-    io::stderr().flush().map_err(failed)?;
+    print_error(&format!("{}\ntype `yes` to go on: ", lines.join("\n")));
     let mut answer = String::new();
     io::stdin().read_line(&mut answer).map_err(failed)?;
     Ok(answer.trim() == "yes")
@@ -165,21 +161,7 @@ mod tests {
     use super::*;
 
     fn vehicle(name: &str, state: VehicleState, site: &str) -> VehicleSummary {
-        VehicleSummary {
-            name: name.to_owned(),
-            labels: [("site".to_owned(), site.to_owned())].into(),
-            state,
-            seen: None,
-            version: None,
-            key: String::new(),
-            wanted: 0,
-            handled: 0,
-            is_ahead: false,
-            is_double: false,
-            problems: Vec::new(),
-            running: 0,
-            deployments: 0,
-        }
+        VehicleSummary { labels: selector(site), ..super::super::test_vehicle(name, state) }
     }
 
     fn selector(site: &str) -> Selector {

@@ -2,9 +2,9 @@
 
 use std::collections::BTreeMap;
 use std::thread;
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant};
 
-use gleaner_base::{Exit, Failure, visible};
+use gleaner_base::{Exit, Failure, in_one_line, visible};
 use gleaner_fleet::WantedProblem;
 use gleaner_fleet::people::{VehicleState, VehicleSummary};
 use gleaner_protocol::supervision::LambdaPhase;
@@ -14,11 +14,10 @@ use serde_json::json;
 
 use super::plan::{FleetPlan, Selector, selects};
 use super::{list, vehicles};
-use crate::render::json_line;
-use crate::stdout::print;
+use crate::output::{print, print_json};
+use crate::since_1970;
 use crate::vehicle::VehicleClient;
 
-/// Interval of looks at the vehicles.
 const POLL_INTERVAL: Duration = Duration::from_millis(500);
 
 /// Maximum number of vehicles in an error; `--json` has all.
@@ -26,9 +25,7 @@ const SHOWN: usize = 20;
 
 /// A change of a deployment on the way to its vehicles.
 pub(super) struct Rollout {
-    /// Id of the deployment.
     pub(super) id: String,
-    /// Labels of its vehicles.
     pub(super) selector: Selector,
     /// SHA-256 of the signed envelope that runs then; `None` if there may be several.
     pub(super) envelope: Option<String>,
@@ -41,15 +38,10 @@ pub(super) struct Rollout {
 /// The state of a deployment that a change requests.
 #[derive(Clone, Copy, PartialEq)]
 pub(super) enum Goal {
-    /// The revision of this release runs.
     Revision { release: u64 },
-    /// It runs.
     Running,
-    /// The fallback runs.
     Fallback,
-    /// It does not run.
     Stopped,
-    /// It is gone.
     Removed,
 }
 
@@ -86,6 +78,24 @@ impl Standing {
     }
 }
 
+/// Polls until there is an answer. After a lost connection it polls again, until `timeout` has
+/// passed since `since`.
+pub(super) fn answer<T>(
+    since: Instant,
+    timeout: Duration,
+    poll: impl Fn() -> Result<T, Failure>,
+) -> Result<T, Failure> {
+    const HELP: &str = "it was sent, and goes on by itself: `gleaner fleet` shows it";
+    loop {
+        match poll() {
+            Err(failure) if failure.exit != Exit::Unreachable => return Err(failure),
+            Err(lost) if since.elapsed() >= timeout => return Err(lost.with_help(HELP)),
+            Err(_) => thread::sleep(POLL_INTERVAL),
+            answer => return answer,
+        }
+    }
+}
+
 impl Rollout {
     /// Waits until no vehicle is on the way any more, and shows the result.
     ///
@@ -101,13 +111,15 @@ impl Rollout {
         let started = Instant::now();
         let mut standings: BTreeMap<String, Standing> = BTreeMap::new();
         loop {
-            let vehicles: Vec<VehicleSummary> = list::all(client, "/v1/vehicles", &[])?;
+            let vehicles = || list::all::<VehicleSummary>(client, "/v1/vehicles", &[]);
+            let vehicles = answer(started, timeout, vehicles)?;
             let mut former = std::mem::take(&mut standings);
             for vehicle in vehicles.iter().filter(|vehicle| self.concerns(vehicle)) {
                 let standing = match former.remove(&vehicle.name).filter(Standing::is_done) {
                     Some(done) => done,
                     None => {
-                        let standing = self.standing(client, vehicle)?;
+                        let standing = || self.standing(client, vehicle);
+                        let standing = answer(started, timeout, standing)?;
                         if standing.is_done() && !json {
                             let (name, (_, text)) = (visible(&vehicle.name), standing.parts());
                             print(&format!("{name}: {text}\n"))?;
@@ -129,7 +141,6 @@ impl Rollout {
         selects(&self.selector, vehicle) || self.plan.names(&vehicle.name)
     }
 
-    /// Returns the state that a vehicle should reach.
     fn goal_of(&self, vehicle: &VehicleSummary) -> Goal {
         let is_removal = self.plan.removes(&vehicle.name) && self.goal != Goal::Stopped;
         if is_removal { Goal::Removed } else { self.goal }
@@ -153,8 +164,8 @@ impl Rollout {
         };
         Ok(match standing {
             Standing::Pending(reason) if vehicle.state == VehicleState::Offline => {
-                let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-                let seen = vehicle.seen.map(|seen| vehicles::seen_before(now.as_secs(), seen));
+                let now = since_1970().as_secs();
+                let seen = vehicle.seen.map(|seen| vehicles::seen_before(now, seen));
                 let seen = seen.map(|seen| format!(", seen {seen}")).unwrap_or_default();
                 Standing::Pending(format!("it is offline{seen}; {reason}"))
             }
@@ -187,7 +198,9 @@ impl Rollout {
         });
         match (standing, mine.next()) {
             (Standing::Pending(_), Some(problem)) => {
-                let reason = problem.in_words();
+                // With its help, and without the id, which this command has named.
+                let reason =
+                    WantedProblem { deployment: String::new(), ..problem.clone() }.explained();
                 match problem.is_pending {
                     true => Standing::Pending(reason),
                     false => Standing::Failed(Exit::Denied, reason),
@@ -221,7 +234,7 @@ impl Rollout {
         let version = visible(&fallback.unwrap_or(&it.revision).version);
         match (self.goal, fallback) {
             (Goal::Revision { .. }, Some(_)) => {
-                let reason = it.failed.as_deref().map(|it| format!(": {}", visible(it)));
+                let reason = it.failed.as_deref().map(|it| format!(": {}", in_one_line(it)));
                 let reason = reason.unwrap_or_default();
                 let text = format!("it runs its fallback {version}{reason}");
                 return Standing::Failed(Exit::LambdaFaulted, text);
@@ -229,11 +242,17 @@ impl Rollout {
             (Goal::Fallback, None) if it.fallback.is_none() => {
                 return Standing::Failed(Exit::Differs, "it has no fallback".to_owned());
             }
-            (Goal::Fallback, None) => return pending("it runs its revision"),
+            (Goal::Fallback, None) if it.is_wanted => return pending("it runs its revision"),
             _ if !it.is_wanted => return pending("it is stopped"),
             _ => {}
         }
         let lambda = it.status.as_ref().filter(|lambda| lambda.attempt >= it.attempt);
+        let on_probation =
+            lambda.filter(|lambda| !it.is_proven && lambda.phase == LambdaPhase::Running);
+        if let Some(faults) = on_probation.and_then(|lambda| lambda.recent.faulty()) {
+            let text = format!("it runs {version}, but {faults}");
+            return Standing::Failed(Exit::LambdaFaulted, text);
+        }
         match lambda.map(|lambda| lambda.phase) {
             Some(LambdaPhase::Running) => Standing::Done(format!("runs {version}")),
             Some(LambdaPhase::Quarantined) => {
@@ -258,9 +277,9 @@ impl Rollout {
             });
             let vehicles = vehicles.collect::<Vec<_>>();
             let plan = self.plan.json();
-            print(&json_line(&json!({
+            print_json(&json!({
                 "id": id, "selector": self.selector, "plan": plan, "vehicles": vehicles,
-            })))?;
+            }))?;
         }
         let text = match done == standings.len() {
             true if standings.is_empty() => match self.goal {

@@ -16,8 +16,7 @@ pub(super) fn tokens(args: &TokensArgs) -> Result<Exit, Failure> {
                 let rows = tokens.iter().map(|it| {
                     [visible(&it.user), visible(&it.name), it.role.to_string(), date(it.expires)]
                 });
-                let head = ["user", "token", "role", "until"].map(str::to_owned);
-                table(std::iter::once(head).chain(rows).collect(), &[])
+                table(&["user", "token", "role", "until"], rows, &[])
             })
         }
         Some(TokensCommand::New(new)) => {

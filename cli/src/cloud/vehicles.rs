@@ -1,24 +1,26 @@
 //! `gleaner vehicles`: the vehicles of a cloud.
 
 use std::path::Path;
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::Duration;
 
 use gleaner_base::{Exit, Failure, format_duration, visible};
 use gleaner_fleet::Enrolment;
-use gleaner_fleet::people::{NewVehicle, VehicleState, VehicleSummary};
+use gleaner_fleet::people::{NewVehicle, VehicleSummary};
 use gleaner_trust::{PublicKey, VehicleName};
+use hyper::Method;
 use serde_json::json;
 
 use super::{client, list, show};
 use crate::account::write_private;
 use crate::args::{NewVehicleArgs, VehiclesArgs, VehiclesCommand};
-use crate::render::{Paint, table};
+use crate::render::{Paint, or_dash, table};
+use crate::since_1970;
 
 pub(super) fn vehicles(args: &VehiclesArgs) -> Result<Exit, Failure> {
     match &args.command {
         None => {
             let vehicles: Vec<VehicleSummary> = list::all(&client()?, "/v1/vehicles", &[])?;
-            let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs();
+            let now = since_1970().as_secs();
             show(args.json, &vehicles, |vehicles| text(vehicles, now, Paint::of_stdout()))
         }
         Some(VehiclesCommand::Enrol(vehicle)) => enrol(vehicle, args.json),
@@ -30,7 +32,7 @@ pub(super) fn vehicles(args: &VehiclesArgs) -> Result<Exit, Failure> {
             })
         }
         Some(VehiclesCommand::Agree { name }) => {
-            client()?.post_nothing(&format!("/v1/vehicles/{name}/agree"))?;
+            client()?.change(Method::POST, &format!("/v1/vehicles/{name}/agree"), None)?;
             show(args.json, &json!({ "name": name, "agreed": true }), |_| {
                 format!("{name} follows the state of this cloud now\n")
             })
@@ -78,15 +80,6 @@ fn keys(vehicles: &[VehicleSummary]) -> Vec<(VehicleName, PublicKey)> {
     vehicles.iter().filter_map(key).collect()
 }
 
-pub(super) fn state(state: VehicleState) -> &'static str {
-    match state {
-        VehicleState::Invited => "invited",
-        VehicleState::Online => "online",
-        VehicleState::Offline => "offline",
-        VehicleState::Revoked => "revoked",
-    }
-}
-
 /// Formats the vehicles at the time `now`, in s since 1970.
 fn text(vehicles: &[VehicleSummary], now: u64, paint: Paint) -> String {
     if vehicles.is_empty() {
@@ -94,19 +87,17 @@ fn text(vehicles: &[VehicleSummary], now: u64, paint: Paint) -> String {
     }
     let head = ["name", "state", "seen", "version", "running", "wanted", "handled"];
     let rows = vehicles.iter().map(|vehicle| {
-        let seen = vehicle.seen.map(|seen| seen_before(now, seen));
         [
             visible(&vehicle.name),
-            state(vehicle.state).to_owned(),
-            seen.unwrap_or_else(|| "-".to_owned()),
-            vehicle.version.as_deref().map_or_else(|| "-".to_owned(), visible),
+            json!(vehicle.state).as_str().unwrap_or_default().to_owned(),
+            or_dash(vehicle.seen, |seen| seen_before(now, seen)),
+            or_dash(vehicle.version.as_deref(), visible),
             format!("{}/{}", vehicle.running, vehicle.deployments),
             vehicle.wanted.to_string(),
             vehicle.handled.to_string(),
         ]
     });
-    let rows = std::iter::once(head.map(str::to_owned)).chain(rows);
-    let mut text = table(rows.collect(), &[4, 5, 6]);
+    let mut text = table(&head, rows, &[4, 5, 6]);
     for vehicle in vehicles {
         if vehicle.is_double {
             let line = format!(
@@ -117,13 +108,7 @@ fn text(vehicles: &[VehicleSummary], now: u64, paint: Paint) -> String {
             text += &format!("{}\n", paint.yellow(&line));
         }
         for problem in &vehicle.problems {
-            let (name, id) = (visible(&vehicle.name), visible(&problem.deployment));
-            let subject = if id.is_empty() { name } else { format!("{name}: {id}") };
-            let help = match problem.help.is_empty() {
-                true => String::new(),
-                false => format!(". {}", visible(&problem.help)),
-            };
-            let line = format!("{subject}: {}{help}", problem.in_words());
+            let line = format!("{}: {}", visible(&vehicle.name), problem.explained());
             text += &format!("{}\n", paint.yellow(&line));
         }
     }
@@ -140,6 +125,7 @@ pub(super) fn seen_before(now: u64, seen: u64) -> String {
 #[cfg(test)]
 mod tests {
     use gleaner_fleet::WantedProblem;
+    use gleaner_fleet::people::VehicleState;
 
     use super::*;
 
@@ -150,19 +136,13 @@ mod tests {
     #[test]
     fn the_list_has_each_vehicle_with_its_problems() {
         let vehicle = |name: &str, seen, problems: &[&str]| VehicleSummary {
-            name: name.to_owned(),
-            labels: Default::default(),
-            state: VehicleState::Online,
             seen,
-            version: None,
-            key: String::new(),
             wanted: 7,
             handled: 6,
-            is_ahead: false,
-            is_double: false,
             problems: problems.iter().map(|text| problem(text)).collect(),
             running: 1,
             deployments: 2,
+            ..super::super::test_vehicle(name, VehicleState::Online)
         };
         let vehicles = [
             vehicle("car-7", Some(100), &["deployment `brake`: no\u{1b}[31m key"]),

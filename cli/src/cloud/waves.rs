@@ -1,22 +1,21 @@
 //! The waves of a deployment: shows them, and waits for them.
 
 use std::thread;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Failure, format_duration, visible};
 use gleaner_fleet::waves::{WaveProgress, WaveState};
 use gleaner_report::format::counted;
 
 use super::fleet::deployments;
+use super::rollout::answer;
 use crate::args::DeployArgs;
-use crate::render::json_line;
-use crate::stdout::print;
+use crate::output::{print, show};
 use crate::vehicle::VehicleClient;
 
 /// Interval of looks at the waves, which open within seconds at best.
 const POLL_INTERVAL: Duration = Duration::from_secs(1);
 
-/// Describes the progress of waves.
 pub(super) fn in_words(waves: &WaveProgress) -> String {
     let WaveProgress { wave, waves: all, state, reason, vehicles, running, failed, .. } = waves;
     let reason = match reason.split(' ').next() {
@@ -47,7 +46,8 @@ pub(super) fn wait(
 ) -> Result<bool, Failure> {
     let mut shown = String::new();
     loop {
-        let found = deployments(client)?.into_iter().find(|it| it.id == id);
+        let all = answer(Instant::now(), args.timeout, || deployments(client))?;
+        let found = all.into_iter().find(|it| it.id == id);
         let Some(deployment) = found.filter(|it| it.envelope == envelope) else {
             let message = format!("this deployment of `{id}` was replaced or removed meanwhile");
             return Err(Failure::new(Exit::Differs, message).with_help("`gleaner fleet` lists all"));
@@ -65,14 +65,13 @@ pub(super) fn wait(
             ));
         }
         if !args.waves.watch {
-            match args.vehicle.json {
-                true => print(&json_line(&deployment))?,
-                false => print(&format!(
+            show(args.vehicle.json, &deployment, |_| {
+                format!(
                     "the next wave opens after {} once {} % run it: `gleaner fleet` shows them\n",
                     format_duration(args.waves.soak),
                     waves.plan.success,
-                ))?,
-            }
+                )
+            })?;
             return Ok(false);
         }
         thread::sleep(POLL_INTERVAL);

@@ -12,9 +12,9 @@ use std::path::{Path, PathBuf};
 use gleaner_base::{ByteSize, Exit, Failure, PlainFile, safe_file, visible};
 use gleaner_report::Diff;
 
-use crate::args::{BuildArgs, DevArgs, ReplayArgs};
+use crate::args::{BuildArgs, ReplayArgs, ReplayedArgs};
+use crate::output::{print, print_error};
 use crate::render::{self, Paint};
-use crate::stdout::print;
 use crate::{build, replay, separate};
 
 use watch::SourceSnapshot;
@@ -30,10 +30,18 @@ const COMPARED: [&str; 4] = ["summary.json", "decisions.jsonl", "signals.json", 
 const KEPT_MAX: ByteSize = ByteSize::gib(1);
 
 /// Runs until the user ends it.
-pub(crate) fn run(args: DevArgs) -> Result<Exit, Failure> {
-    let dir = args.target.lambda.clone();
-    let out = args.out.clone().unwrap_or_else(|| dir.join("out"));
-    let replay = replay_args(args);
+pub(crate) fn run(replayed: ReplayedArgs) -> Result<Exit, Failure> {
+    let dir = replayed.target.lambda.clone();
+    let out = replayed.out();
+    let replay = ReplayArgs {
+        replayed,
+        all: false,
+        topics: Vec::new(),
+        journal: None,
+        verify: None,
+        no_report: false,
+        json: false,
+    };
     // The first comparison is with the results of an earlier session, if there are any.
     let mut kept = separate::result_folders(&out);
     kept.retain(|out| keep(out));
@@ -107,28 +115,12 @@ fn keep(out: &Path) -> bool {
         Ok(()) => true,
         Err(error) if error.kind() == io::ErrorKind::NotFound => false,
         Err(error) => {
-            eprintln!("warning: cannot copy `{}` for the next comparison: {error}", out.display());
+            print_error(&format!(
+                "warning: cannot copy `{}` for the next comparison: {error}\n",
+                out.display()
+            ));
             false
         }
-    }
-}
-
-fn replay_args(args: DevArgs) -> ReplayArgs {
-    let DevArgs { target, drives, merge, from, to, out, no_record } = args;
-    ReplayArgs {
-        target,
-        drives,
-        from,
-        to,
-        out,
-        all: false,
-        no_record,
-        topics: Vec::new(),
-        journal: None,
-        verify: None,
-        merge,
-        no_report: false,
-        json: false,
     }
 }
 

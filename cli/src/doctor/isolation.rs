@@ -1,11 +1,9 @@
 //! Checks the isolation layers of a lambda's process: `gleaner-shim` sets each one up and tests it.
 
-use std::process::Command;
-
 use gleaner_parts::Parts;
 use gleaner_protocol::{Holds, Layer};
 
-use super::{Finding, Severity};
+use super::{Finding, Severity, output_of};
 
 /// Returns a finding for each layer.
 pub(super) fn findings(parts: &Parts) -> Vec<Finding> {
@@ -18,8 +16,7 @@ pub(super) fn findings(parts: &Parts) -> Vec<Finding> {
 }
 
 fn layers(parts: &Parts) -> Result<Vec<Layer>, String> {
-    let shim = parts.program("gleaner-shim").map_err(|error| error.to_string())?;
-    let output = Command::new(&shim).arg("--layers").output().map_err(|error| error.to_string())?;
+    let output = output_of(parts, "gleaner-shim", "--layers")?;
     if !output.status.success() {
         return Err(format!(
             "gleaner-shim failed: {}",

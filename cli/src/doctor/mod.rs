@@ -6,13 +6,14 @@ mod isolation;
 mod network;
 mod vehicle;
 
+use std::process::{Command, Output};
+
 use gleaner_base::{Exit, Failure};
 use gleaner_parts::Parts;
 use serde::Serialize;
 
 use crate::args::DoctorArgs;
-use crate::render::json_line;
-use crate::stdout::print;
+use crate::output::show;
 
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 struct Finding {
@@ -54,8 +55,9 @@ pub(crate) fn run(args: &DoctorArgs) -> Result<Exit, Failure> {
     findings.extend(isolation::findings(&parts));
     findings.extend(network::findings(&parts));
     findings.extend(vehicle::findings());
-    let text = findings.iter().map(if args.json { json_line::<Finding> } else { text });
-    print(&text.collect::<String>())?;
+    for finding in &findings {
+        show(args.json, finding, text)?;
+    }
     let has_error = findings.iter().any(|finding| finding.state == Severity::Error);
     Ok(if has_error { Exit::Internal } else { Exit::Ok })
 }
@@ -69,6 +71,11 @@ fn program(parts: &Parts, name: &'static str) -> Finding {
             Finding { subject: name, state: Severity::Error, detail, help }
         }
     }
+}
+
+fn output_of(parts: &Parts, name: &str, argument: &str) -> Result<Output, String> {
+    let program = parts.program(name).map_err(|error| error.to_string())?;
+    Command::new(program).arg(argument).output().map_err(|error| error.to_string())
 }
 
 fn optional(parts: &Parts, name: &'static str, why: &str) -> Finding {

@@ -2,14 +2,13 @@
 
 use std::fs;
 use std::net::Ipv4Addr;
-use std::process::Command;
 
 use gleaner_base::{Exit, ignored_variables};
 use gleaner_parts::Parts;
 use nix::ifaddrs::getifaddrs;
 use nix::net::if_::InterfaceFlags;
 
-use super::Finding;
+use super::{Finding, output_of};
 
 const UP: InterfaceFlags = InterfaceFlags::IFF_UP;
 const MULTICAST: InterfaceFlags = InterfaceFlags::IFF_MULTICAST;
@@ -22,7 +21,6 @@ const FILTER_BYTES: u64 = 128 << 10;
 /// itself by unicast to the first twelve.
 const WITHOUT_MULTICAST: usize = 12;
 
-/// An interface of this machine.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Interface {
     name: String,
@@ -98,9 +96,7 @@ fn real_time(parts: &Parts) -> Finding {
 }
 
 fn is_real_time_permitted(parts: &Parts) -> Result<bool, String> {
-    let ingress = parts.program("gleaner-ingress").map_err(|error| error.to_string())?;
-    let output = Command::new(ingress).arg("real-time").output();
-    let output = output.map_err(|error| error.to_string())?;
+    let output = output_of(parts, "gleaner-ingress", "real-time")?;
     if output.status.success() {
         return Ok(true);
     }

@@ -7,7 +7,7 @@ use std::path::Path;
 use std::process::Command;
 use std::sync::mpsc;
 use std::thread;
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::Duration;
 
 use gleaner_base::{ByteSize, Failure, format_duration};
 use gleaner_protocol::supervision::SupervisorStatus;
@@ -16,6 +16,7 @@ use gleaner_report::format::size;
 
 use super::Finding;
 use crate::args::VehicleArgs;
+use crate::since_1970;
 use crate::vehicle::VehicleClient;
 
 /// Places of the service as its package installs it.
@@ -48,7 +49,7 @@ pub(super) fn findings() -> Vec<Finding> {
         let text = "no service on this machine; `gleaner run` needs none";
         return vec![Finding::ok("vehicle", text)];
     }
-    let mut findings = vec![clock(unix_time(SystemTime::now()), built())];
+    let mut findings = vec![clock(since_1970().as_secs(), built())];
     findings.extend(unit.as_deref().map(service));
     findings.extend(socket.parent().and_then(|folder| fs::metadata(folder).ok()).map(group));
     findings.extend(state.as_ref().map(folder));
@@ -73,7 +74,7 @@ fn running(status: &VehicleStatus) -> Vec<Finding> {
     vec![
         Finding::ok("gleaner-orchestrator", format!("version {}, {up}", orchestrator.version)),
         supervisor(status.supervisor.as_ref()),
-        trust(status.trust.as_ref(), unix_time(SystemTime::now())),
+        trust(status.trust.as_ref(), since_1970().as_secs()),
     ]
 }
 
@@ -236,12 +237,8 @@ fn is_chosen() -> bool {
 
 /// The time at which this program was built: that of its file, in s since 1970.
 fn built() -> u64 {
-    let modified = std::env::current_exe().and_then(fs::metadata).and_then(|it| it.modified());
-    modified.map_or(0, unix_time)
-}
-
-fn unix_time(time: SystemTime) -> u64 {
-    time.duration_since(UNIX_EPOCH).unwrap_or_default().as_secs()
+    let file = std::env::current_exe().and_then(fs::metadata);
+    file.map_or(0, |file| file.mtime().try_into().unwrap_or(0))
 }
 
 fn uptime(seconds: f64) -> String {

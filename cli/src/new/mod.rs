@@ -14,7 +14,8 @@ use gleaner_lambda::Manifest;
 use gleaner_lambda::manifest::{LambdaKind, LambdaName, NameError};
 
 use crate::args::NewArgs;
-use crate::stdout::print;
+use crate::output::print;
+use crate::remove_folder;
 
 /// Embedded files by their path in the repository.
 const PACKED: &[(&str, &[u8])] = include!(concat!(env!("OUT_DIR"), "/packed.rs"));
@@ -52,21 +53,17 @@ enum NewError {
 
 impl Explain for NewError {
     fn help(&self) -> Option<String> {
-        match self {
-            Self::NoName { .. } => {
-                Some("name the folder to create, such as: gleaner new brake-dark".to_owned())
-            }
-            Self::Name(error) => error.help(),
-            Self::NotEmpty { .. } => Some(
+        let help = match self {
+            Self::NoName { .. } => "name the folder to create, such as: gleaner new brake-dark",
+            Self::Name(error) => return error.help(),
+            Self::NotEmpty { .. } => {
                 "choose another name; to update only the SDK in it: gleaner new --update DIR"
-                    .to_owned(),
-            ),
-            Self::NoSdk { .. } => {
-                Some("name the folder of a lambda that `gleaner new` created".to_owned())
             }
-            Self::CrateName { .. } => Some("Rust reserves it; choose another name".to_owned()),
-            Self::File { .. } => Some("choose a writable folder, on a disk with room".to_owned()),
-        }
+            Self::NoSdk { .. } => "name the folder of a lambda that `gleaner new` created",
+            Self::CrateName { .. } => "Rust reserves it; choose another name",
+            Self::File { .. } => "choose a writable folder, on a disk with room",
+        };
+        Some(help.to_owned())
     }
 
     fn exit(&self) -> Exit {
@@ -233,12 +230,7 @@ fn is_empty(folder: &Path) -> bool {
 }
 
 fn remove(folder: &Path) -> Result<(), NewError> {
-    match fs::remove_dir_all(folder) {
-        Err(error) if error.kind() != io::ErrorKind::NotFound => {
-            Err(failed("remove", folder)(error))
-        }
-        _ => Ok(()),
-    }
+    remove_folder(folder).map_err(failed("remove", folder))
 }
 
 fn failed(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> NewError {

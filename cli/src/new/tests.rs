@@ -1,45 +1,28 @@
 //! Tests of `gleaner new`.
 
 use gleaner_lambda::Manifest;
+use tempfile::TempDir;
 use toml::{Table, Value};
 
 use super::*;
 
-struct TempFolder(PathBuf);
-
-impl TempFolder {
-    fn new(name: &str) -> Self {
-        let folder =
-            std::env::temp_dir().join(format!("gleaner-new-{}-{name}", std::process::id()));
-        drop(fs::remove_dir_all(&folder));
-        fs::create_dir_all(&folder).unwrap();
-        Self(folder)
-    }
-
-    fn lambda(&self, name: &str, kind: LambdaKind) -> PathBuf {
-        let dir = self.0.join(name);
-        make(&dir, &name.parse().unwrap(), kind).unwrap();
-        dir
-    }
-}
-
-impl Drop for TempFolder {
-    fn drop(&mut self) {
-        drop(fs::remove_dir_all(&self.0));
-    }
+fn lambda(scratch: &TempDir, name: &str, kind: LambdaKind) -> PathBuf {
+    let dir = scratch.path().join(name);
+    make(&dir, &name.parse().unwrap(), kind).unwrap();
+    dir
 }
 
 #[test]
 fn a_new_lambda_has_a_valid_manifest_with_its_name_and_entry() {
-    let scratch = TempFolder::new("manifest");
+    let scratch = tempfile::tempdir().unwrap();
     for (kind, entry) in [(LambdaKind::Wasm, "pot-hole.wasm"), (LambdaKind::Python, "main.py")] {
-        let dir = scratch.lambda("pot-hole", kind);
+        let dir = lambda(&scratch, "pot-hole", kind);
         let manifest = Manifest::load(&dir).unwrap();
         assert_eq!((manifest.lambda.name.as_str(), manifest.lambda.kind), ("pot-hole", kind));
         assert_eq!(manifest.lambda.entry.to_string(), entry);
         assert!(dir.join(source(kind)).is_file());
         let placeholders = ["NAME", "VERSION", "TEST", "SOURCE", "hello"];
-        assert_eq!(fs::read_dir(&scratch.0).unwrap().count(), 1);
+        assert_eq!(fs::read_dir(scratch.path()).unwrap().count(), 1);
         for file in ["README.md", "lambda.toml"] {
             let text = fs::read_to_string(dir.join(file)).unwrap();
             assert!(placeholders.iter().all(|word| !text.contains(word)), "{text}");
@@ -50,23 +33,23 @@ fn a_new_lambda_has_a_valid_manifest_with_its_name_and_entry() {
 
 #[test]
 fn existing_files_are_not_changed() {
-    let scratch = TempFolder::new("there");
-    let dir = scratch.lambda("mine", LambdaKind::Python);
+    let scratch = tempfile::tempdir().unwrap();
+    let dir = lambda(&scratch, "mine", LambdaKind::Python);
     fs::write(dir.join("main.py"), "precious").unwrap();
     let again = make(&dir, &"mine".parse().unwrap(), LambdaKind::Python).unwrap_err();
     assert!(matches!(again, NewError::NotEmpty { .. }), "{again}");
     update(&dir).unwrap();
     assert_eq!(fs::read_to_string(dir.join("main.py")).unwrap(), "precious");
-    let elsewhere = scratch.0.join("link");
+    let elsewhere = scratch.path().join("link");
     std::os::unix::fs::symlink(&dir, &elsewhere).unwrap();
     assert!(make(&elsewhere, &"link".parse().unwrap(), LambdaKind::Python).is_err());
 }
 
 #[test]
 fn an_update_replaces_the_whole_sdk_folder() {
-    let scratch = TempFolder::new("update");
+    let scratch = tempfile::tempdir().unwrap();
     for kind in [LambdaKind::Wasm, LambdaKind::Python] {
-        let dir = scratch.lambda("mine", kind);
+        let dir = lambda(&scratch, "mine", kind);
         let (stale, wit) = (dir.join(SDK).join("stale"), dir.join(SDK).join("wit"));
         fs::write(&stale, "").unwrap();
         fs::remove_dir_all(&wit).unwrap();
@@ -75,13 +58,13 @@ fn an_update_replaces_the_whole_sdk_folder() {
         assert!(!dir.join(".gleaner.old").exists() && !dir.join(".gleaner.partial").exists());
         fs::remove_dir_all(dir).unwrap();
     }
-    assert!(update(&scratch.0).unwrap_err().to_string().contains("does not exist"));
+    assert!(update(scratch.path()).unwrap_err().to_string().contains("does not exist"));
 }
 
 #[test]
 fn parent_folders_are_created() {
-    let scratch = TempFolder::new("above");
-    let dir = scratch.0.join("far/away");
+    let scratch = tempfile::tempdir().unwrap();
+    let dir = scratch.path().join("far/away");
     make(&dir, &"away".parse().unwrap(), LambdaKind::Python).unwrap();
     assert!(dir.join("lambda.toml").is_file());
 }
@@ -97,9 +80,9 @@ fn a_folder_needs_a_name_that_a_lambda_can_have() {
         assert!(error.to_string().contains(message) && error.help().is_some(), "{error}");
     }
     assert_eq!(name_of(Path::new("some/where/pot-hole/")).unwrap().as_str(), "pot-hole");
-    let scratch = TempFolder::new("names");
+    let scratch = tempfile::tempdir().unwrap();
     for name in ["test", "gleaner-rules", "gleaner-sdk", "type"] {
-        let result = make(&scratch.0.join(name), &name.parse().unwrap(), LambdaKind::Wasm);
+        let result = make(&scratch.path().join(name), &name.parse().unwrap(), LambdaKind::Wasm);
         assert!(matches!(result, Err(NewError::CrateName { .. })), "{name}");
     }
 }

@@ -7,13 +7,10 @@ use gleaner_lambda::manifest::LambdaKind;
 use gleaner_protocol::{CheckReport, Need, NeedPlace};
 use gleaner_report::format::size;
 
-use super::Paint;
+use super::{Paint, written};
 
 pub(crate) fn check_report(report: &CheckReport, paint: Paint) -> String {
-    let mut text = String::new();
-    // Writing to a string cannot fail.
-    let _ = write(&mut text, report, paint);
-    text
+    written(|text| write(text, report, paint))
 }
 
 fn write(text: &mut String, report: &CheckReport, paint: Paint) -> fmt::Result {

@@ -34,30 +34,16 @@ pub(super) fn one(text: &mut String, clip: &Clip, when: &str, paint: Paint) -> f
     let thumbnail =
         clip.thumbnail.as_ref().map(|path| format!("; {}", visible(&path.to_string_lossy())));
     writeln!(text, "{:>14}{}{}", "", clip_contents(clip), thumbnail.unwrap_or_default())?;
-    for why in &clip.incomplete {
-        writeln!(text, "{:>14}{}", "", paint.yellow(&format!("incomplete: {}", visible(why))))?;
-    }
-    for loss in losses(clip) {
-        writeln!(text, "{:>14}{}", "", paint.yellow(&format!("lost: {loss}")))?;
-    }
-    if let Some(recovered) = &clip.recovered {
-        let what = format!(
-            "recovered: {} ({} lost)",
-            visible(&recovered.note),
-            counted(recovered.lost_bytes, "byte")
-        );
-        writeln!(text, "{:>14}{}", "", paint.yellow(&what))?;
-    }
-    Ok(())
-}
-
-/// Returns a line for each topic with messages lost upstream. Losses of the recorder itself are in
-/// `incomplete`.
-fn losses(clip: &Clip) -> Vec<String> {
-    let lost =
-        clip.topics.iter().filter_map(|topic| Some((topic, topic.lost.filter(|lost| *lost > 0)?)));
-    let lines = lost.map(|(topic, lost)| {
-        format!("{} of {}, upstream", counted(lost, "message"), visible(&topic.topic))
+    let incomplete = clip.incomplete.iter().map(|why| format!("incomplete: {}", visible(why)));
+    // Losses of the recorder itself are in `incomplete`.
+    let lost = clip.topics.iter().filter_map(|topic| {
+        let lost = counted(topic.lost.filter(|lost| *lost > 0)?, "message");
+        Some(format!("lost: {lost} of {}, upstream", visible(&topic.topic)))
     });
-    lines.collect()
+    let recovered = clip.recovered.as_ref().map(|recovered| {
+        let lost = counted(recovered.lost_bytes, "byte");
+        format!("recovered: {} ({lost} lost)", visible(&recovered.note))
+    });
+    let mut notes = incomplete.chain(lost).chain(recovered);
+    notes.try_for_each(|note| writeln!(text, "{:>14}{}", "", paint.yellow(&note)))
 }

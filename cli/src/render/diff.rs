@@ -8,17 +8,13 @@ use gleaner_report::{
     ChangeCounts, ChangeKind, ComparedRun, Cost, Diff, Difference, DifferenceKind, ValueChange,
 };
 
-use super::Paint;
+use super::{Paint, written};
 
 /// Maximum number of shown differences of each kind and change; the others are counted.
 const SHOWN: usize = 20;
 
-/// Formats the differences.
 pub(crate) fn diff(diff: &Diff, paint: Paint) -> String {
-    let mut text = String::new();
-    // Writing to a string cannot fail.
-    let _ = write(&mut text, diff, paint);
-    text
+    written(|text| write(text, diff, paint))
 }
 
 fn write(text: &mut String, diff: &Diff, paint: Paint) -> fmt::Result {

@@ -44,10 +44,9 @@ pub(crate) fn drive(drive: &DriveInfo) -> String {
         let _ =
             writeln!(text, "{} out of order by log time", counted(drive.out_of_order, "message"));
     }
-    let head = ["topic", "type", "messages", "Hz", "longest gap", "at", "missing", "largest", ""]
-        .map(str::to_owned);
+    let head = ["topic", "type", "messages", "Hz", "longest gap", "at", "missing", "largest", ""];
     let rows = drive.topics.iter().map(|topic| row(topic, start));
-    text += &table(std::iter::once(head).chain(rows).collect(), &[2, 3, 4, 5, 6, 7]);
+    text += &table(&head, rows, &[2, 3, 4, 5, 6, 7]);
     if drive.skipped > 0 {
         let _ = writeln!(text, "and {}, not read", counted(drive.skipped, "more topic"));
     }

@@ -7,14 +7,14 @@ use gleaner_protocol::inference::{InferenceReport, InferenceStatus, LoadedModel,
 use gleaner_report::format::{counted, grouped};
 use gleaner_supervisor::InferenceEvent;
 
-use super::{Paint, mib};
+use super::{Paint, mib, written};
 
 /// Formats an event of the process; empty if it has no text for the user.
-pub(crate) fn inference_event(event: &InferenceEvent, paint: Paint) -> Vec<u8> {
-    let warning = |text: &str| format!("warning: {}\n", visible(text)).into_bytes();
+pub(crate) fn inference_event(event: &InferenceEvent, paint: Paint) -> String {
+    let warning = |text: &str| format!("warning: {}\n", visible(text));
     match event {
-        InferenceEvent::Report(report) => inference(report, paint).into_bytes(),
-        InferenceEvent::Stderr(text) => text.clone(),
+        InferenceEvent::Report(report) => inference(report, paint),
+        InferenceEvent::Stderr(text) => String::from_utf8_lossy(text).into_owned(),
         InferenceEvent::Ended(reason, delay) => {
             warning(&format!("{reason}; restarting in {} s", delay.as_secs_f64()))
         }
@@ -25,14 +25,11 @@ pub(crate) fn inference_event(event: &InferenceEvent, paint: Paint) -> Vec<u8> {
 /// Formats a report: a model that was loaded or could not be, and the final status; all others are
 /// empty.
 pub(crate) fn inference(report: &InferenceReport, paint: Paint) -> String {
-    let mut text = String::new();
-    // Writing to a string cannot fail.
-    let _ = match report {
-        InferenceReport::Model(model) => write_model(&mut text, model, paint),
-        InferenceReport::Ended(status) => write_status(&mut text, status, paint),
+    written(|text| match report {
+        InferenceReport::Model(model) => write_model(text, model, paint),
+        InferenceReport::Ended(status) => write_status(text, status, paint),
         InferenceReport::Ready | InferenceReport::Status(_) => Ok(()),
-    };
-    text
+    })
 }
 
 fn write_model(text: &mut String, model: &LoadedModel, paint: Paint) -> fmt::Result {

@@ -7,14 +7,11 @@ use gleaner_protocol::NetworkStatus;
 use gleaner_protocol::ingress::{IngressStatus, IngressTopic};
 use gleaner_report::format::{counted, grouped};
 
-use super::live::table;
-use super::{Paint, mib};
+use super::live::{table, write_indented};
+use super::{Paint, mib, written};
 
 pub(crate) fn ingress(status: &IngressStatus, paint: Paint) -> String {
-    let mut text = String::new();
-    // Writing to a string cannot fail.
-    let _ = write_ingress(&mut text, status, paint);
-    text
+    written(|text| write_ingress(text, status, paint))
 }
 
 fn write_ingress(text: &mut String, status: &IngressStatus, paint: Paint) -> fmt::Result {
@@ -23,11 +20,8 @@ fn write_ingress(text: &mut String, status: &IngressStatus, paint: Paint) -> fmt
     let readers = counted(status.readers as u64, "reader");
     writeln!(text, "{}{domain}: {readers}", paint.bold("ingress"))?;
     if !status.topics.is_empty() {
-        let head = HEAD.map(str::to_owned);
-        let rows = std::iter::once(head).chain(status.topics.iter().map(row)).collect();
-        for line in table(rows, &[1, 2, 3, 4, 5, 6, 7]).lines() {
-            writeln!(text, "  {line}")?;
-        }
+        let rows = status.topics.iter().map(row);
+        write_indented(text, &table(&HEAD, rows, &[1, 2, 3, 4, 5, 6, 7]))?;
     }
     for warning in status.topics.iter().flat_map(|topic| &topic.reception.qos_warnings) {
         writeln!(text, "  {}", paint.yellow(&visible(warning)))?;

@@ -11,21 +11,14 @@ use gleaner_protocol::{DurationStats, LiveStatus, LiveTopic, ReceptionGaps, Repo
 use gleaner_report::format::{clip_span, counted, fault_kind, grouped, three_digits};
 use serde_json::Value;
 
-use super::{Paint, mib};
+use super::{BACKED_OFF, OVER_EVENTS, OVER_RATE, Paint, mib, written};
 
-/// Formats the status of a lambda.
 pub(crate) fn live(live: &LiveStatus, paint: Paint) -> String {
-    let mut text = String::new();
-    // Writing to a string cannot fail.
-    let _ = write_live(&mut text, live, paint);
-    text
+    written(|text| write_live(text, live, paint))
 }
 
 pub(crate) fn recorder(status: &RecorderStatus, paint: Paint) -> String {
-    let mut text = String::new();
-    // Writing to a string cannot fail.
-    let _ = write_recorder(&mut text, status, paint);
-    text
+    written(|text| write_recorder(text, status, paint))
 }
 
 /// Returns a report as JSON, with the name of its lambda first. The name that its process reports
@@ -54,17 +47,13 @@ pub(crate) fn topics(topics: &[TopicInfo]) -> String {
             visible(&topic.qos.join("; ")),
         ]
     });
-    let head = ["topic", "type", "writers", "readers", "QoS"].map(str::to_owned);
-    table(std::iter::once(head).chain(rows).collect(), &[2, 3])
+    table(&["topic", "type", "writers", "readers", "QoS"], rows, &[2, 3])
 }
 
 /// Formats a clip that was just completed.
 pub(crate) fn clip_line(clip: &Clip, paint: Paint) -> String {
     let [from, to] = clip_span(clip).map(time_of_day);
-    let mut text = String::new();
-    // Writing to a string cannot fail.
-    let _ = super::clips::one(&mut text, clip, &format!("{from} to {to}  clip"), paint);
-    text
+    written(|text| super::clips::one(text, clip, &format!("{from} to {to}  clip"), paint))
 }
 
 /// Formats a decision: a line for each trigger and fault, with `prefix` after the time.
@@ -110,7 +99,7 @@ fn write_live(text: &mut String, live: &LiveStatus, paint: Paint) -> fmt::Result
     ];
     let latencies: Vec<String> = spreads
         .iter()
-        .filter_map(|(what, spread)| spread.map(|spread| format!("{what} {}", in_ms(&spread))))
+        .filter_map(|(what, spread)| spread.map(|spread| format!("{what} {}", in_ms(&spread, 3))))
         .collect();
     if !latencies.is_empty() {
         writeln!(text, "  {} ms (p50 / p99 / max)", latencies.join(", "))?;
@@ -126,11 +115,8 @@ fn write_live(text: &mut String, live: &LiveStatus, paint: Paint) -> fmt::Result
         "skipped",
         "newest",
     ];
-    let rows =
-        std::iter::once(head.map(str::to_owned)).chain(live.topics.iter().map(row)).collect();
-    for line in table(rows, &[2, 3, 4, 5, 6, 7, 8]).lines() {
-        writeln!(text, "  {line}")?;
-    }
+    let rows = live.topics.iter().map(row);
+    write_indented(text, &table(&head, rows, &[2, 3, 4, 5, 6, 7, 8]))?;
     write_gaps(text, live.reception_gaps, paint)?;
     for (count, thing, why) in live_losses(live).into_iter().filter(|(count, ..)| *count > 0) {
         writeln!(text, "  {}", paint.yellow(&format!("lost: {}, {why}", counted(count, thing))))?;
@@ -141,28 +127,17 @@ fn write_live(text: &mut String, live: &LiveStatus, paint: Paint) -> fmt::Result
 /// Returns each count of lost data that is not a sample of a topic, with its thing and its cause;
 /// also those that are 0.
 pub(crate) fn live_losses(live: &LiveStatus) -> [(u64, &'static str, &'static str); 9] {
+    let link = live.recorder_link.unwrap_or_default();
     [
         (live.missed_ticks, "tick", "missed"),
-        (live.log_dropped, "log line", "over the rate limit"),
-        (live.triggers_refused, "trigger", "refused: over `events_per_minute`"),
-        (live.backed_off, "wake", "skipped in the pauses after repeated faults"),
+        (live.log_dropped, "log line", OVER_RATE),
+        (live.triggers_refused, "trigger", OVER_EVENTS),
+        (live.backed_off, "wake", BACKED_OFF),
         (live.unwritten, "decision or log line", "not written"),
         (live.unsent, "message", "not sent: a reader of `--rtt` or `--decisions` is too slow"),
-        (
-            live.recorder_link.map_or(0, |recorder| recorder.wakes_dropped),
-            "wake",
-            "not sent to the recorder",
-        ),
-        (
-            live.recorder_link.map_or(0, |recorder| recorder.triggers_lost),
-            "trigger",
-            "not sent to the recorder",
-        ),
-        (
-            live.recorder_link.map_or(0, |recorder| recorder.recorders_ended),
-            "recorder",
-            "ended: clips lack the time until the next one",
-        ),
+        (link.wakes_dropped, "wake", "not sent to the recorder"),
+        (link.triggers_lost, "trigger", "not sent to the recorder"),
+        (link.recorders_ended, "recorder", "ended: clips lack the time until the next one"),
     ]
 }
 
@@ -184,8 +159,9 @@ fn write_usage(text: &mut String, rss_bytes: u64, cpu_s: f64, paint: Paint) -> f
 }
 
 fn write_recorder(text: &mut String, status: &RecorderStatus, paint: Paint) -> fmt::Result {
-    let opened =
-        status.trigger_to_open.map(|spread| format!("; trigger to window {} ms", in_ms(&spread)));
+    let opened = status
+        .trigger_to_open
+        .map(|spread| format!("; trigger to window {} ms", in_ms(&spread, 3)));
     writeln!(
         text,
         "{}: {}, {}{}; preroll {:.1} of {:.1} MiB{}",
@@ -197,11 +173,8 @@ fn write_recorder(text: &mut String, status: &RecorderStatus, paint: Paint) -> f
         mib(status.preroll_bound),
         opened.unwrap_or_default(),
     )?;
-    let head = ["topic", "received", "no slot", "too big"].map(str::to_owned);
-    let rows = std::iter::once(head).chain(status.topics.iter().map(recorded)).collect();
-    for line in table(rows, &[1, 2, 3]).lines() {
-        writeln!(text, "  {line}")?;
-    }
+    let head = ["topic", "received", "no slot", "too big"];
+    write_indented(text, &table(&head, status.topics.iter().map(recorded), &[1, 2, 3]))?;
     write_gaps(text, status.reception_gaps, paint)?;
     if let Some(commands) = &status.commands {
         let line = format!(
@@ -236,24 +209,31 @@ fn row(topic: &LiveTopic) -> [String; 9] {
     ]
 }
 
-fn in_ms(spread: &DurationStats) -> String {
-    let ms = |ns: u64| format!("{:.3}", ns as f64 / 1e6);
+/// Formats p50, p99 and maximum in ms.
+pub(crate) fn in_ms(spread: &DurationStats, digits: usize) -> String {
+    let ms = |ns: u64| format!("{:.digits$}", ns as f64 / 1e6);
     format!("{} / {} / {}", ms(spread.p50_ns), ms(spread.p99_ns), ms(spread.max_ns))
 }
 
-/// Formats a table. Columns are as wide as their widest cell; those in `numbers` are right-aligned.
-pub(crate) fn table<const N: usize>(rows: Vec<[String; N]>, numbers: &[usize]) -> String {
-    let width =
-        |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
-    let widths: Vec<usize> = (0..N).map(width).collect();
+/// Formats a table with a head. Columns are as wide as their widest cell; those in `numbers` are
+/// right-aligned.
+pub(crate) fn table<R: AsRef<[String]>>(
+    head: &[&str],
+    rows: impl IntoIterator<Item = R>,
+    numbers: &[usize],
+) -> String {
+    let rows: Vec<R> = rows.into_iter().collect();
+    debug_assert!(rows.iter().all(|row| row.as_ref().len() == head.len()));
+    let cells = rows.iter().map(|row| row.as_ref().iter().map(String::as_str).collect::<Vec<_>>());
+    let lines: Vec<Vec<&str>> = std::iter::once(head.to_vec()).chain(cells).collect();
+    let width = |column: usize| lines.iter().map(|line| line[column].chars().count()).max();
+    let widths: Vec<usize> = (0..head.len()).map(|column| width(column).unwrap_or(0)).collect();
     let mut text = String::new();
-    for row in &rows {
-        let cells = row.iter().enumerate().map(|(column, cell)| {
-            let width = widths[column];
-            if numbers.contains(&column) {
-                format!("{cell:>width$}")
-            } else {
-                format!("{cell:<width$}")
+    for line in lines {
+        let cells = line.iter().zip(&widths).enumerate().map(|(column, (cell, &width))| {
+            match numbers.contains(&column) {
+                true => format!("{cell:>width$}"),
+                false => format!("{cell:<width$}"),
             }
         });
         text += cells.collect::<Vec<_>>().join("  ").trim_end();
@@ -262,8 +242,16 @@ pub(crate) fn table<const N: usize>(rows: Vec<[String; N]>, numbers: &[usize]) -
     text
 }
 
+pub(crate) fn or_dash<T>(value: Option<T>, text: impl FnOnce(T) -> String) -> String {
+    value.map_or_else(|| "-".to_owned(), text)
+}
+
+pub(super) fn write_indented(text: &mut String, lines: &str) -> fmt::Result {
+    lines.lines().try_for_each(|line| writeln!(text, "  {line}"))
+}
+
 /// Formats the time of day, in UTC.
-pub(crate) fn time_of_day(at_ns: i64) -> String {
+fn time_of_day(at_ns: i64) -> String {
     let ms = at_ns.div_euclid(1_000_000).rem_euclid(86_400_000);
     let (hours, minutes, seconds) = (ms / 3_600_000, ms / 60_000 % 60, ms / 1000 % 60);
     format!("{hours:02}:{minutes:02}:{seconds:02}.{:03}", ms % 1000)
@@ -275,8 +263,8 @@ mod tests {
 
     #[test]
     fn columns_are_as_wide_as_their_widest_cell() {
-        let rows = vec![["a", "1"].map(str::to_owned), ["topic", "23"].map(str::to_owned)];
-        assert_eq!(table(rows, &[1]), "a       1\ntopic  23\n");
+        let rows = [["topic", "23"].map(str::to_owned)];
+        assert_eq!(table(&["a", "1"], rows, &[1]), "a       1\ntopic  23\n");
     }
 
     #[test]

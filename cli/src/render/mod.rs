@@ -27,12 +27,29 @@ pub(crate) use inference::{inference, inference_event};
 pub(crate) use ingress::ingress;
 pub(crate) use isolation::isolation;
 pub(crate) use live::{
-    clip_line, decision, live, live_losses, named_report, recorder, table, time_of_day, topics,
+    clip_line, decision, in_ms, live, live_losses, named_report, or_dash, recorder, table, topics,
 };
 
-/// Formats a report as one line of JSON.
+/// Formats a report as one line of JSON. It also escapes the characters that act on a terminal,
+/// which are in strings only.
 pub(crate) fn json_line<T: serde::Serialize>(result: &T) -> String {
-    serde_json::to_string(result).expect("a report has only text keys and finite numbers") + "\n"
+    let json =
+        serde_json::to_string(result).expect("a report has only text keys and finite numbers");
+    let mut line = String::with_capacity(json.len() + 1);
+    for character in json.chars() {
+        match visible(character.encode_utf8(&mut [0; 4])).starts_with(character) {
+            true => line.push(character),
+            false => line += &format!("\\u{:04x}", u32::from(character)),
+        }
+    }
+    line + "\n"
+}
+
+fn written(write: impl FnOnce(&mut String) -> fmt::Result) -> String {
+    let mut text = String::new();
+    // Writing to a string cannot fail.
+    let _ = write(&mut text);
+    text
 }
 
 /// Maximum number of shown trigger bursts, and of shown fault groups; the others are counted.
@@ -171,18 +188,11 @@ pub(crate) fn summary(
     clips: &[Clip],
     paint: Paint,
 ) -> String {
-    let mut text = String::new();
-    // Writing to a string cannot fail.
-    let _ = write_summary(&mut text, summary, digest, clips, paint);
-    text
+    written(|text| write_summary(text, summary, digest, clips, paint))
 }
 
-/// Formats the result of verifying a journal.
 pub(crate) fn verified(verified: &Verified, paint: Paint) -> String {
-    let mut text = String::new();
-    // Writing to a string cannot fail.
-    let _ = write_verified(&mut text, verified, paint);
-    text
+    written(|text| write_verified(text, verified, paint))
 }
 
 fn write_verified(text: &mut String, verified: &Verified, paint: Paint) -> fmt::Result {
@@ -246,11 +256,8 @@ fn write_summary(
     }
     if summary.out_of_order > 0 {
         let messages = counted(summary.out_of_order, "message");
-        writeln!(
-            text,
-            "  {}",
-            paint.yellow(&format!("out of order: {messages} came after one with a later log time"))
-        )?;
+        let line = format!("out of order: {messages} came after one with a later log time");
+        writeln!(text, "  {}", paint.yellow(&line))?;
     }
     for (topic, messages) in &summary.malformed {
         let (topic, messages) = (visible(topic), counted(*messages, "message"));
@@ -261,11 +268,8 @@ fn write_summary(
 
     if !summary.part.is_all() {
         let [from_s, to_s] = [from_ns, to_ns].map(|ns| seconds(ns, summary.start_ns));
-        writeln!(
-            text,
-            "  {}",
-            paint.dim(&format!("part of the drive: from {from_s:.3} s to {to_s:.3} s"))
-        )?;
+        let line = format!("part of the drive: from {from_s:.3} s to {to_s:.3} s");
+        writeln!(text, "  {}", paint.dim(&line))?;
     }
     for model in &summary.models {
         writeln!(text, "  {}", paint.dim(&visible(model)))?;
@@ -276,11 +280,8 @@ fn write_summary(
     }
     write!(text, ", total run time {:.3} s", summary.run_s)?;
     if summary.decode_s > 0.0 {
-        write!(
-            text,
-            " ({:.0} % decoding)",
-            100.0 * summary.decode_s / summary.run_s.max(summary.decode_s)
-        )?;
+        let share = 100.0 * summary.decode_s / summary.run_s.max(summary.decode_s);
+        write!(text, " ({share:.0} % decoding)")?;
     }
     writeln!(text, ", peak memory {:.1} MiB", mib(summary.peak_rss_bytes))?;
     let clips = if clips.is_empty() { "" } else { ", clips.jsonl, clips/" };
@@ -297,14 +298,9 @@ fn write_faults(text: &mut String, faults: u64, digest: &Digest, paint: Paint) -
     }
     writeln!(text, "  {}", paint.red(&counted(faults, "fault")))?;
     for cause in &digest.fault_groups {
-        let kind = fault_kind(cause.kind);
-        writeln!(
-            text,
-            "{:>10.3} s  {}x {kind}: {}",
-            cause.first_seconds,
-            grouped(cause.count),
-            cause.message
-        )?;
+        let FaultGroup { kind, message, count, first_seconds, .. } = cause;
+        let (kind, count) = (fault_kind(*kind), grouped(count));
+        writeln!(text, "{first_seconds:>10.3} s  {count}x {kind}: {message}")?;
     }
     more(text, digest.other_faults)
 }
@@ -329,15 +325,11 @@ fn write_early_end(text: &mut String, summary: &ReplaySummary, paint: Paint) -> 
 fn write_counted(text: &mut String, recording: &RecordingCounts, paint: Paint) -> fmt::Result {
     for counted in recording.by_cause().into_iter().filter(|counted| counted.count > 0) {
         let line = counted.in_words();
-        writeln!(
-            text,
-            "  {}",
-            if counted.outcome == LossOutcome::NoWindow {
-                paint.dim(&line)
-            } else {
-                paint.yellow(&line)
-            }
-        )?;
+        let line = match counted.outcome {
+            LossOutcome::NoWindow => paint.dim(&line),
+            _ => paint.yellow(&line),
+        };
+        writeln!(text, "  {line}")?;
     }
     Ok(())
 }
@@ -348,6 +340,11 @@ fn more(text: &mut String, count: u64) -> fmt::Result {
     }
     Ok(())
 }
+
+/// Causes of losses, of a replay and live.
+const OVER_RATE: &str = "over the rate limit";
+const OVER_EVENTS: &str = "refused: over `events_per_minute`";
+const BACKED_OFF: &str = "skipped in the pauses after repeated faults";
 
 /// Returns a line for each loss, with its cause. Samples that newer ones overwrote in a ring do not
 /// count as lost.
@@ -362,27 +359,13 @@ fn losses(summary: &ReplaySummary) -> Vec<String> {
         causes.map(|(count, why)| (count, format!("{} of {name}, {why}", counted(count, "sample"))))
     };
     let overall = [
-        (summary.skipped, format!("{}, skipped", counted(summary.skipped, "event sample"))),
-        (summary.missed_ticks, format!("{}, missed", counted(summary.missed_ticks, "tick"))),
-        (
-            summary.log_dropped,
-            format!("{}, over the rate limit", counted(summary.log_dropped, "log line")),
-        ),
-        (
-            summary.triggers_refused,
-            format!(
-                "{}, refused: over `events_per_minute`",
-                counted(summary.triggers_refused, "trigger")
-            ),
-        ),
-        (
-            summary.backed_off,
-            format!(
-                "{}, skipped in the pauses after repeated faults",
-                counted(summary.backed_off, "wake")
-            ),
-        ),
-    ];
+        (summary.skipped, "event sample", "skipped"),
+        (summary.missed_ticks, "tick", "missed"),
+        (summary.log_dropped, "log line", OVER_RATE),
+        (summary.triggers_refused, "trigger", OVER_EVENTS),
+        (summary.backed_off, "wake", BACKED_OFF),
+    ]
+    .map(|(count, thing, why)| (count, format!("{}, {why}", counted(count, thing))));
     let all = summary.topics.iter().flat_map(of_topic).chain(overall);
     all.filter(|(count, _)| *count > 0).map(|(_, loss)| loss).collect()
 }
@@ -390,6 +373,10 @@ fn losses(summary: &ReplaySummary) -> Vec<String> {
 fn mib(bytes: u64) -> f64 {
     bytes as f64 / (1024.0 * 1024.0)
 }
+
+/// The sequences of [`Paint`]: its colours, and their end.
+const COLOURS: [&str; 6] =
+    ["\u{1b}[0m", "\u{1b}[1m", "\u{1b}[2m", "\u{1b}[31m", "\u{1b}[32m", "\u{1b}[33m"];
 
 /// Terminal colours, if enabled.
 #[derive(Debug, Clone, Copy)]
@@ -416,27 +403,40 @@ impl Paint {
     }
 
     pub(crate) fn bold(self, text: &str) -> String {
-        self.with("1", text)
+        self.with(COLOURS[1], text)
     }
 
     pub(crate) fn dim(self, text: &str) -> String {
-        self.with("2", text)
+        self.with(COLOURS[2], text)
     }
 
     pub(crate) fn red(self, text: &str) -> String {
-        self.with("31", text)
+        self.with(COLOURS[3], text)
     }
 
     pub(crate) fn green(self, text: &str) -> String {
-        self.with("32", text)
+        self.with(COLOURS[4], text)
     }
 
     pub(crate) fn yellow(self, text: &str) -> String {
-        self.with("33", text)
+        self.with(COLOURS[5], text)
     }
 
-    fn with(self, code: &str, text: &str) -> String {
-        if self.on { format!("\u{1b}[{code}m{text}\u{1b}[0m") } else { text.to_owned() }
+    fn with(self, colour: &str, text: &str) -> String {
+        if self.on { format!("{colour}{text}{}", COLOURS[0]) } else { text.to_owned() }
+    }
+
+    /// Escapes what acts on a terminal, but for line ends and tabs, and for these colours if they
+    /// are enabled. Untrusted text that did not pass `visible` before can set them, and nothing
+    /// else.
+    pub(crate) fn escaped(self, text: &str) -> String {
+        fn without(kept: &[&str], text: &str) -> String {
+            let Some((&first, others)) = kept.split_first() else { return visible(text) };
+            let parts = text.split(first).map(|part| without(others, part));
+            parts.collect::<Vec<_>>().join(first)
+        }
+        let colours = if self.on { &COLOURS[..] } else { &[] };
+        without(&[&["\n", "\t"][..], colours].concat(), text)
     }
 }
 

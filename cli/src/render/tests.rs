@@ -218,6 +218,12 @@ fn colours_are_used_only_if_enabled() {
     assert_eq!(Paint { on: true }.red("x"), "\u{1b}[31mx\u{1b}[0m");
     assert_eq!(PLAIN.red("x"), "x");
     assert!(!Paint::new(false).on);
+    let colours = Paint { on: true };
+    let own = format!("{}\t{}\n", colours.bold("x"), colours.yellow("y"));
+    assert_eq!(colours.escaped(&own), own);
+    let hostile = "\u{1b}[1mx\u{1b}[2J\r\u{9b}\u{202e}";
+    assert_eq!(colours.escaped(hostile), "\u{1b}[1mx\\u{1b}[2J\\r\\u{9b}\\u{202e}");
+    assert!(PLAIN.escaped(hostile).is_ascii() && !PLAIN.escaped(hostile).contains('\u{1b}'));
 }
 
 /// Returns a clip from 5.8 to 9.0 s of a window up to 15.8 s.

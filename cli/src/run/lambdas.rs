@@ -47,7 +47,6 @@ pub(super) fn load(args: &RunArgs) -> Result<Vec<LambdaSpec>, Failure> {
     Ok(lambdas)
 }
 
-/// Returns the topics of a manifest.
 fn topics(manifest: &Manifest) -> impl Iterator<Item = &str> {
     let inputs = manifest.inputs.iter().map(|input| &input.topic);
     inputs.chain(manifest.record.iter().flat_map(|record| &record.topics)).map(AsRef::as_ref)
@@ -104,9 +103,9 @@ fn same_name(name: &str, first: &Path, second: &Path) -> Failure {
 
 fn named_clips(out: &Path) -> Failure {
     let message = format!("`{}` cannot hold the results of a lambda", out.display());
-    let mut failure = Failure::new(Exit::Usage, message);
-    failure.causes = vec!["it holds the clips of all lambdas".to_owned()];
-    failure.with_help(format!("change the name `{CLIPS}` in lambda.toml, or run the lambda alone"))
+    let causes = vec!["it holds the clips of all lambdas".to_owned()];
+    Failure { causes, ..Failure::new(Exit::Usage, message) }
+        .with_help(format!("change the name `{CLIPS}` in lambda.toml, or run the lambda alone"))
 }
 
 fn no_lambda_of(setting: &str, lambdas: &[LambdaSpec]) -> Failure {

@@ -5,14 +5,15 @@ use std::io::{self, Write};
 use std::time::{Duration, Instant};
 
 use gleaner_base::visible;
-use gleaner_lambda::{Clip, Decision};
+use gleaner_lambda::Clip;
 use gleaner_protocol::ingress::{IngressReport, IngressStatus};
-use gleaner_protocol::link::{Loss, RecorderReport, RecorderStatus};
+use gleaner_protocol::link::{Loss, RecorderReport};
 use gleaner_protocol::{LiveStatus, LiveTopic, Report};
 use gleaner_supervisor::{InferenceEvent, LambdaSpec, RestartedPart, RunObserver};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
 
+use crate::output::print_error;
 use crate::render::{self, Paint};
 
 /// Time without a writer after which a warning about a topic is printed, in s.
@@ -67,30 +68,15 @@ impl Screen {
         }
     }
 
-    /// Prints permanent text, unless `--json` is set.
+    /// Prints permanent text, escaped, unless `--json` is set.
     fn print(&self, text: &str) {
         if !self.json {
-            self.out(text);
+            self.out(&self.paint.escaped(text));
         }
-    }
-
-    /// Reports that a lambda is ready. `prefix` is its name before each line, if there are several.
-    fn ready(&self, prefix: &str) {
-        let how_to_end = if prefix.is_empty() { "; Ctrl-C ends it" } else { "" };
-        self.print(&format!("{prefix}running{how_to_end}\n"));
-    }
-
-    fn decision(&self, prefix: &str, decision: &Decision) {
-        self.print(&render::decision(decision, prefix, self.paint));
     }
 
     fn clip(&self, clip: &Clip) {
         self.print(&render::clip_line(clip, self.paint));
-    }
-
-    fn recorder_ended(&mut self, status: &RecorderStatus) {
-        self.recorder.clear();
-        self.print(&render::recorder(status, self.paint));
     }
 
     fn live(&mut self, lambda: &str, live: &LiveStatus) {
@@ -116,7 +102,7 @@ impl Screen {
         }
         self.shown = Instant::now();
         let lambdas: String = self.lambdas.values().map(String::as_str).collect();
-        let text = format!("{}{lambdas}{}", self.ingress, self.recorder);
+        let text = self.paint.escaped(&format!("{}{lambdas}{}", self.ingress, self.recorder));
         if self.below.is_hidden() {
             self.out(&text);
         } else {
@@ -176,8 +162,14 @@ impl RunObserver for Screen {
             Report::Isolation { layers } => {
                 self.print(&format!("{prefix}{}", render::isolation(layers)));
             }
-            Report::Ready => self.ready(prefix),
-            Report::Decision(decision) => self.decision(prefix, decision),
+            Report::Ready => {
+                // Of several lambdas, each has its name before its lines.
+                let how_to_end = if prefix.is_empty() { "; Ctrl-C ends it" } else { "" };
+                self.print(&format!("{prefix}running{how_to_end}\n"));
+            }
+            Report::Decision(decision) => {
+                self.print(&render::decision(decision, prefix, self.paint));
+            }
             Report::Live(live) => self.live(name, live),
             Report::Ended(live) => self.ended(name, live),
             _ => {}
@@ -214,27 +206,30 @@ impl RunObserver for Screen {
                 self.warn("recovered a clip of an earlier recorder that crashed");
                 self.clip(clip);
             }
-            RecorderReport::Loss(Loss::Deleted { file, reason, .. }) => {
-                self.warn(&format!("deleted the clip `{}`: {reason}", file.display()));
-            }
-            RecorderReport::Loss(Loss::NotDeleted { file, reason, .. }) => {
-                self.warn(&format!("cannot delete the clip `{}`: {reason}", file.display()));
-            }
-            RecorderReport::Loss(Loss::Failed { reason, .. }) => {
-                self.warn(&format!("cannot write a clip: {reason}"));
-            }
-            RecorderReport::Loss(Loss::DiskSuppressed { triggers, reason, .. }) => {
-                self.warn(&format!("{triggers} triggers without a window: {reason}"));
-            }
+            RecorderReport::Loss(loss) => self.warn(&match loss {
+                Loss::Deleted { file, reason, .. } => {
+                    format!("deleted the clip `{}`: {reason}", file.display())
+                }
+                Loss::NotDeleted { file, reason, .. } => {
+                    format!("cannot delete the clip `{}`: {reason}", file.display())
+                }
+                Loss::Failed { reason, .. } => format!("cannot write a clip: {reason}"),
+                Loss::DiskSuppressed { triggers, reason, .. } => {
+                    format!("{triggers} triggers without a window: {reason}")
+                }
+            }),
             RecorderReport::Status(status) => self.recorder = render::recorder(status, self.paint),
-            RecorderReport::Ended(status) => self.recorder_ended(status),
+            RecorderReport::Ended(status) => {
+                self.recorder.clear();
+                self.print(&render::recorder(status, self.paint));
+            }
             RecorderReport::Ready => {}
         }
     }
 
     fn inference(&mut self, event: InferenceEvent) {
         let InferenceEvent::Report(report) = &event else {
-            return self.stderr(&render::inference_event(&event, self.paint));
+            return self.stderr(render::inference_event(&event, self.paint).as_bytes());
         };
         self.report(report);
         self.print(&render::inference(report, self.paint));
@@ -254,7 +249,6 @@ impl RunObserver for Screen {
     }
 
     fn stderr(&mut self, piece: &[u8]) {
-        // An error of standard error itself cannot be reported.
-        self.below.suspend(|| drop(io::stderr().write_all(piece)));
+        self.below.suspend(|| print_error(&String::from_utf8_lossy(piece)));
     }
 }

@@ -21,7 +21,7 @@ use tokio::time::timeout;
 
 use super::file_body::FileBody;
 use crate::account::{CloudAccount, LOGIN_HELP};
-use crate::args::{OnArgs, VehicleArgs};
+use crate::args::{StatusArgs, VehicleArgs};
 
 /// Folder of the socket without another choice.
 const RUN_DIR: &str = "/run/gleaner";
@@ -57,12 +57,12 @@ impl VehicleClient {
     }
 
     /// Creates a client of the vehicle that was chosen: one of the cloud, or this machine.
-    pub(crate) fn of(args: &VehicleArgs, on: &OnArgs) -> Result<Self, Failure> {
-        match &on.vehicle {
+    pub(crate) fn of(args: &StatusArgs) -> Result<Self, Failure> {
+        match &args.on.vehicle {
             Some(name) => {
                 Self::to(Endpoint::Cloud(CloudAccount::load()?), format!("/v1/vehicles/{name}"))
             }
-            None => Self::new(args),
+            None => Self::new(&args.vehicle),
         }
     }
 
@@ -78,7 +78,6 @@ impl VehicleClient {
         Ok(Self { endpoint, root, runtime })
     }
 
-    /// Returns the path of the socket of the orchestrator.
     pub(crate) fn socket(args: &VehicleArgs) -> PathBuf {
         let variable = || std::env::var_os("GLEANER_RUN").filter(|it| !it.is_empty());
         let chosen = args.run_dir.clone().or_else(|| variable().map(PathBuf::from));
@@ -87,17 +86,17 @@ impl VehicleClient {
 
     /// Returns the name of the receiver of requests, for messages.
     pub(crate) fn receiver(&self) -> &'static str {
-        match self.endpoint {
-            Endpoint::Orchestrator(_) => "the vehicle",
-            Endpoint::Cloud(_) => "the cloud",
-        }
+        if self.is_cloud() { "the cloud" } else { "the vehicle" }
+    }
+
+    fn is_cloud(&self) -> bool {
+        matches!(self.endpoint, Endpoint::Cloud(_))
     }
 
     pub(crate) fn status(&self) -> Result<VehicleStatus, Failure> {
         self.get("/v1/status")
     }
 
-    /// Returns the answer to a request without effect.
     pub(crate) fn get<T: DeserializeOwned>(&self, path: &str) -> Result<T, Failure> {
         self.get_sized(path).map(|(answer, _)| answer)
     }
@@ -105,7 +104,7 @@ impl VehicleClient {
     /// Returns the answer to a request without effect, and its length in bytes.
     pub(crate) fn get_sized<T: DeserializeOwned>(&self, path: &str) -> Result<(T, usize), Failure> {
         self.runtime.block_on(async {
-            let answer = self.json(Method::GET, path, Bytes::new());
+            let answer = self.json(Method::GET, path, Bytes::new(), &[]);
             timeout(ANSWER_TIMEOUT, answer).await.unwrap_or_else(|_| {
                 let seconds = ANSWER_TIMEOUT.as_secs();
                 let message = format!("{} has not answered for {seconds} s", self.program());
@@ -121,7 +120,7 @@ impl VehicleClient {
         body: &impl Serialize,
     ) -> Result<T, Failure> {
         let body = serde_json::to_vec(body).expect("a request is plain data");
-        let answer = self.json(Method::POST, path, body.into());
+        let answer = self.json(Method::POST, path, body.into(), &[]);
         self.runtime.block_on(answer).map(|(answer, _)| answer)
     }
 
@@ -132,21 +131,18 @@ impl VehicleClient {
         path: &str,
         body: &impl Serialize,
     ) -> Result<T, Failure> {
-        if matches!(self.endpoint, Endpoint::Orchestrator(_)) {
+        if !self.is_cloud() {
             return self.post(path, body);
         }
-        let body = serde_json::to_vec(body).expect("a request is plain data");
+        let body: Bytes = serde_json::to_vec(body).expect("a request is plain data").into();
         let mut bytes = [0; 16];
         getrandom::fill(&mut bytes).map_err(|error| {
             Failure::caused_by(Exit::Internal, "cannot make a key for the request", &error)
         })?;
         let key = [("idempotency-key", gleaner_base::hex(&bytes))];
         let send = || {
-            self.runtime.block_on(async {
-                let body = Either::Left(Full::new(body.clone().into()));
-                let answer = self.request_with(Method::POST, path, body, &key).await?;
-                self.parsed(answer).await.map(|(answer, _)| answer)
-            })
+            let answer = self.json(Method::POST, path, body.clone(), &key);
+            self.runtime.block_on(answer).map(|(answer, _)| answer)
         };
         match send() {
             Err(failure) if failure.exit == Exit::Unreachable => send(),
@@ -154,49 +150,38 @@ impl VehicleClient {
         }
     }
 
-    /// Sends a request that has no content and no answer.
-    pub(crate) fn post_nothing(&self, path: &str) -> Result<(), Failure> {
-        self.runtime.block_on(async {
-            let body = Either::Left(Full::default());
-            self.request(Method::POST, path, body).await.map(drop)
-        })
-    }
-
     /// Sends a change without content, of the state with this version if there is one.
     pub(crate) fn change(
         &self,
         method: Method,
         path: &str,
-        version: &Option<String>,
+        version: Option<&str>,
     ) -> Result<(), Failure> {
-        let state = version.iter().map(|it| ("if-match", format!("\"{it}\""))).collect::<Vec<_>>();
-        self.runtime.block_on(async {
-            let body = Either::Left(Full::default());
-            self.request_with(method, path, body, &state).await.map(drop)
-        })
+        let state = version.map(|it| ("if-match", format!("\"{it}\"")));
+        self.send(method, path, nothing(), state.as_slice())
     }
 
-    /// Sends a request to remove something.
     pub(crate) fn delete(&self, path: &str) -> Result<(), Failure> {
-        self.runtime.block_on(async {
-            let body = Either::Left(Full::default());
-            self.request(Method::DELETE, path, body).await.map(drop)
-        })
+        self.change(Method::DELETE, path, None)
     }
 
-    /// Sends bytes.
     pub(crate) fn put(&self, path: &str, body: Vec<u8>) -> Result<(), Failure> {
-        self.runtime.block_on(async {
-            let body = Either::Left(Full::new(body.into()));
-            self.request(Method::PUT, path, body).await.map(drop)
-        })
+        self.send(Method::PUT, path, Either::Left(Full::new(body.into())), &[])
     }
 
     pub(super) fn put_file(&self, path: &str, file: std::fs::File) -> Result<(), Failure> {
-        self.runtime.block_on(async {
-            let body = Either::Right(FileBody::new(file));
-            self.request(Method::PUT, path, body).await.map(drop)
-        })
+        self.send(Method::PUT, path, Either::Right(FileBody::new(file)), &[])
+    }
+
+    /// Sends a request whose answer has no content.
+    fn send(
+        &self,
+        method: Method,
+        path: &str,
+        body: Content,
+        headers: &[(&str, String)],
+    ) -> Result<(), Failure> {
+        self.runtime.block_on(self.request(method, path, body, headers)).map(drop)
     }
 
     /// Calls `take` with each line of an answer, until its end.
@@ -206,8 +191,8 @@ impl VehicleClient {
         mut take: impl FnMut(&str) -> Result<(), Failure>,
     ) -> Result<(), Failure> {
         self.runtime.block_on(async {
-            let body = Either::Left(Full::default());
-            let mut body = self.request(Method::GET, path, body).await?.into_body();
+            let answer = self.request(Method::GET, path, nothing(), &[]).await?;
+            let mut body = answer.into_body();
             let mut text: Vec<u8> = Vec::new();
             while let Some(frame) = body.frame().await {
                 let frame = frame.map_err(|error| self.lost(&error))?;
@@ -234,9 +219,8 @@ impl VehicleClient {
         mut take: impl FnMut(&[u8]) -> Result<(), Failure>,
     ) -> Result<(), Failure> {
         self.runtime.block_on(async {
-            let body = Either::Left(Full::default());
             let range = (from > 0).then(|| ("range", format!("bytes={from}-")));
-            let answer = self.request_with(Method::GET, path, body, range.as_slice()).await?;
+            let answer = self.request(Method::GET, path, nothing(), range.as_slice()).await?;
             if from > 0 && answer.status() != StatusCode::PARTIAL_CONTENT {
                 let message = format!("{} does not continue a file", self.program());
                 return Err(Failure::new(Exit::Internal, message)
@@ -253,21 +237,16 @@ impl VehicleClient {
         })
     }
 
+    /// Sends a request; returns the content of its answer, and the length of that in bytes.
     async fn json<T: DeserializeOwned>(
         &self,
         method: Method,
         path: &str,
         body: Bytes,
+        headers: &[(&str, String)],
     ) -> Result<(T, usize), Failure> {
-        let answer = self.request(method, path, Either::Left(Full::new(body))).await?;
-        self.parsed(answer).await
-    }
-
-    /// Returns the content of an answer, and its length in bytes.
-    async fn parsed<T: DeserializeOwned>(
-        &self,
-        answer: Response<Incoming>,
-    ) -> Result<(T, usize), Failure> {
+        let body = Either::Left(Full::new(body));
+        let answer = self.request(method, path, body, headers).await?;
         let body = self.whole(answer.into_body()).await?;
         let parsed = serde_json::from_slice(&body).map_err(|error| {
             Failure::caused_by(Exit::Internal, "cannot parse the answer", &error)
@@ -276,18 +255,8 @@ impl VehicleClient {
         Ok((parsed?, body.len()))
     }
 
-    /// Sends a request; returns its answer if that is no error.
+    /// Sends a request with these headers; returns its answer if that is no error.
     async fn request(
-        &self,
-        method: Method,
-        path: &str,
-        body: Content,
-    ) -> Result<Response<Incoming>, Failure> {
-        self.request_with(method, path, body, &[]).await
-    }
-
-    /// As [`request`](Self::request), with further headers.
-    async fn request_with(
         &self,
         method: Method,
         path: &str,
@@ -392,11 +361,13 @@ impl VehicleClient {
     }
 
     fn program(&self) -> &'static str {
-        match self.endpoint {
-            Endpoint::Orchestrator(_) => "gleaner-orchestrator",
-            Endpoint::Cloud(_) => "gleaner-cloud",
-        }
+        if self.is_cloud() { "gleaner-cloud" } else { "gleaner-orchestrator" }
     }
+}
+
+/// The body of a request without content.
+fn nothing() -> Content {
+    Either::Left(Full::default())
 }
 
 fn unreachable(socket: &Path, error: &std::io::Error) -> Failure {

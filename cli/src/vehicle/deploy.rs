@@ -4,12 +4,12 @@
 use std::collections::BTreeMap;
 use std::str::FromStr;
 use std::thread;
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant};
 
-use gleaner_base::{Exit, Failure, PlainFile, format_duration, visible};
+use gleaner_base::{Exit, Failure, PlainFile, format_duration, in_one_line, visible};
 use gleaner_fleet::people::{FleetDeployRequest, ReportedRelease};
 use gleaner_lambda::layout::FILE_MAX;
-use gleaner_lambda::manifest::{ConfigSet, ConfigValue, ItemName, LambdaName, Sha256};
+use gleaner_lambda::manifest::{ConfigSet, ConfigValue, ItemName, Sha256};
 use gleaner_lambda::{BuildDir, Manifest};
 use gleaner_protocol::supervision::{LambdaPhase, LambdaStatus};
 use gleaner_protocol::vehicle_api::{Changed, DeployReply, DeploymentStatus, MissingObject};
@@ -23,22 +23,27 @@ use serde_json::json;
 use super::client::VehicleClient;
 use super::former::{Fallback, Former, changes};
 use crate::args::{ChangeArgs, DeployArgs, VehicleArgs};
-use crate::render::json_line;
-use crate::stdout::print;
+use crate::output::{print, print_json, show};
+use crate::since_1970;
 
-/// Interval of looks at the status.
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
 
 /// Number of times that files are sent: another deployment may remove some in between.
 const ROUNDS: u32 = 5;
 
-/// A revision on this machine.
 pub(crate) struct LocalRevision {
     envelope: String,
     revision: Revision,
     pub(crate) digest: Sha256,
     build: BuildDir,
     manifest: Manifest,
+}
+
+/// A deployment that is about to be signed.
+pub(crate) struct NextDeployment {
+    pub(crate) deployment: Deployment,
+    /// Lines on what it changes.
+    changes: Vec<String>,
 }
 
 /// A deployment that was accepted.
@@ -56,19 +61,21 @@ pub(crate) fn deploy(args: &DeployArgs) -> Result<Exit, Failure> {
     let status = client.status()?;
     let id = local.id(args);
     let before = status.deployments.iter().find(|deployment| deployment.id == id);
-    let of = (&*id, local.lambda());
-    let former = before.map(|_| Former::fetch(&client, args, &key, of)).transpose()?.flatten();
+    let failed = before.map(|before| (has_failed(before).into(), 1));
+    let next = local.next(&client, args, &key, failed)?;
     let release = before.map(|before| before.release).or(status.removed.get(&id).copied());
     let reported = ReportedRelease { vehicle: status.vehicle, release: release.unwrap_or(0) };
-    let (named, has_failed) = (named_fallback(args)?, before.is_some_and(|it| it.runs_fallback));
-    let former = former.as_ref();
-    let fallback = Fallback::choose(args, named.as_ref(), (former, has_failed), &local.digest);
-    let deployment = deployment(args, &local, &id, (former, fallback), Some(&reported))?;
-    if !args.vehicle.json {
-        print_lines(&changes(&deployment, former, fallback))?;
-    }
-    let sent = local.deploy(&client, args, &deployment, &key)?;
+    next.announce(args, Some(&reported))?;
+    let sent = local.deploy(&client, args, &next.deployment, &key)?;
     wait(&client, &args.vehicle, &id, sent.attempt, args.timeout)
+}
+
+/// Returns whether the revision of a deployment has failed, also one without a fallback.
+fn has_failed(it: &DeploymentStatus) -> bool {
+    let lambda = it.status.as_ref().filter(|lambda| lambda.attempt >= it.attempt);
+    let is_faulty = |lambda: &LambdaStatus| !it.is_proven && lambda.recent.faulty().is_some();
+    let has_failed = |lambda| is_faulty(lambda) || lambda.phase == LambdaPhase::Quarantined;
+    it.runs_fallback || lambda.is_some_and(has_failed)
 }
 
 /// Runs `gleaner rollback`, `gleaner start` and `gleaner stop`.
@@ -89,12 +96,42 @@ pub(crate) fn remove(args: &ChangeArgs) -> Result<Exit, Failure> {
 
 /// Returns the path of a deployment in requests.
 pub(crate) fn path(id: &str) -> Result<String, Failure> {
+    checked_id(id).map(|id| format!("/v1/deployments/{id}"))
+}
+
+/// Returns an id that can be one of a deployment.
+pub(super) fn checked_id(id: &str) -> Result<&str, Failure> {
     if id.parse::<ItemName>().is_err() {
         let id = gleaner_base::excerpt(id);
         return Err(Failure::new(Exit::Usage, format!("`{id}` is no id of a deployment"))
             .with_help("`gleaner status` lists them"));
     }
-    Ok(format!("/v1/deployments/{id}"))
+    Ok(id)
+}
+
+impl NextDeployment {
+    /// Prints what it changes.
+    ///
+    /// # Errors
+    ///
+    /// A failure if `reported` is a release as high as this one: a vehicle accepts only a higher
+    /// one, and who signs decides which.
+    pub(crate) fn announce(
+        &self,
+        args: &DeployArgs,
+        reported: Option<&ReportedRelease>,
+    ) -> Result<(), Failure> {
+        let Deployment { id, release, .. } = &self.deployment;
+        let higher = reported.filter(|it| args.release.is_none() && it.release >= *release);
+        if let Some(ReportedRelease { vehicle, release: reported }) = higher {
+            let message = format!("this would be release {release} of `{id}`");
+            let vehicle = visible(vehicle);
+            let cause = format!("{vehicle} reports release {reported}, and refuses lower ones");
+            return Err(Failure { causes: vec![cause], ..Failure::new(Exit::Denied, message) }
+                .with_help("choose the number yourself: `--release N`"));
+        }
+        if args.vehicle.json { Ok(()) } else { print_lines(&self.changes) }
+    }
 }
 
 impl LocalRevision {
@@ -119,14 +156,67 @@ impl LocalRevision {
         Ok(Self { envelope, revision, digest, build, manifest })
     }
 
-    /// Returns the name of the lambda.
-    pub(crate) fn lambda(&self) -> &LambdaName {
-        &self.revision.name
-    }
-
-    /// Returns the id of its deployment.
     pub(crate) fn id(&self, args: &DeployArgs) -> String {
         args.id.clone().unwrap_or_else(|| self.revision.name.to_string())
+    }
+
+    /// Returns the deployment of this revision. `failed` is the number of vehicles on which the
+    /// former one has failed, and of all that have it. Everything in it is of the options, of
+    /// manifests, or of what deployers signed.
+    ///
+    /// # Errors
+    ///
+    /// A failure if an option is not valid, or the former one cannot be verified.
+    pub(crate) fn next(
+        &self,
+        client: &VehicleClient,
+        args: &DeployArgs,
+        key: &SecretKey,
+        failed: Option<(u64, u64)>,
+    ) -> Result<NextDeployment, Failure> {
+        check_once("--label", &args.label)?;
+        check_once("--set", &args.set)?;
+        let id = self.id(args);
+        let of = (&*id, &self.revision.name);
+        let former = failed.map(|_| Former::fetch(client, args, key, of)).transpose()?.flatten();
+        let former = former.as_ref();
+        let failed = failed.unwrap_or_default();
+        let named = args.fallback.as_deref().filter(|named| *named != "none");
+        let named = named.map(|digest| parse::<Sha256>("--fallback", digest)).transpose()?;
+        let fallback = Fallback::choose(args, named.as_ref(), (former, failed), &self.digest);
+        check_order(&self.revision, former)?;
+        let label = |text: &String| {
+            let (name, value) = text.split_once('=').unwrap_or((text, ""));
+            Ok((parse("--label", name)?, value.to_owned()))
+        };
+        let manifests =
+            std::iter::once(&self.manifest).chain(fallback.and_then(|it| it.manifest()));
+        let created = since_1970().as_secs();
+        let newest = former.map_or(0, |former| former.deployment.release);
+        let deployment = Deployment {
+            id: parse("--id", &id)?,
+            // One that is too high is refused by its format.
+            release: args.release.unwrap_or(newest.saturating_add(1)),
+            selector: args.label.iter().map(label).collect::<Result<_, Failure>>()?,
+            revision: self.digest.clone(),
+            fallback: fallback.map(|fallback| fallback.digest.clone()),
+            config: config(&self.manifest, &args.set)?,
+            grants: grants(manifests),
+            created,
+            expires: created.saturating_add(args.expires.as_secs()),
+        };
+        let mut changes = changes(&deployment, former, fallback);
+        let has_own = former.is_some_and(|former| former.deployment.fallback.is_some());
+        // A revision that failed on some vehicles only may still be the fallback.
+        if failed.0 > 0 && args.fallback.is_none() && fallback.is_some() == has_own {
+            let on = match args.fleet {
+                true => format!(" on {}", counted(failed.0, "vehicle")),
+                false => String::new(),
+            };
+            let end = if has_own { "" } else { " and has none" };
+            changes[0] += &format!(", as the one before failed{on}{end}");
+        }
+        Ok(NextDeployment { deployment, changes })
     }
 
     /// Signs a deployment and sends it with all missing files.
@@ -200,57 +290,6 @@ impl LocalRevision {
     }
 }
 
-/// Returns the deployment of a revision, which follows the former one. Everything in it is of the
-/// options, of manifests, or of what deployers signed.
-///
-/// # Errors
-///
-/// A failure if an option is not valid, or `reported` is a release as high as this one: a vehicle
-/// accepts only a higher one, and who signs decides which.
-pub(crate) fn deployment(
-    args: &DeployArgs,
-    local: &LocalRevision,
-    id: &str,
-    (former, fallback): (Option<&Former>, Option<Fallback<'_>>),
-    reported: Option<&ReportedRelease>,
-) -> Result<Deployment, Failure> {
-    let created = now();
-    let newest = former.map_or(0, |former| former.deployment.release);
-    // One that is too high is refused by its format.
-    let release = args.release.unwrap_or(newest.saturating_add(1));
-    let higher = reported.filter(|it| args.release.is_none() && it.release >= release);
-    if let Some(ReportedRelease { vehicle, release: reported }) = higher {
-        let message = format!("this would be release {release} of `{id}`");
-        let mut failure = Failure::new(Exit::Denied, message);
-        let vehicle = visible(vehicle);
-        failure.causes =
-            vec![format!("{vehicle} reports release {reported}, and refuses lower ones")];
-        return Err(failure.with_help("choose the number yourself: `--release N`"));
-    }
-    let label = |text: &String| {
-        let (name, value) = text.split_once('=').unwrap_or((text, ""));
-        Ok((parse("--label", name)?, value.to_owned()))
-    };
-    let manifests = std::iter::once(&local.manifest).chain(fallback.and_then(|it| it.manifest()));
-    Ok(Deployment {
-        id: parse("--id", id)?,
-        release,
-        selector: args.label.iter().map(label).collect::<Result<_, Failure>>()?,
-        revision: local.digest.clone(),
-        fallback: fallback.map(|fallback| fallback.digest.clone()),
-        config: config(&local.manifest, &args.set)?,
-        grants: grants(manifests),
-        created,
-        expires: created.saturating_add(args.expires.as_secs()),
-    })
-}
-
-/// Returns the digest that `--fallback` names.
-pub(crate) fn named_fallback(args: &DeployArgs) -> Result<Option<Sha256>, Failure> {
-    let named = args.fallback.as_deref().filter(|named| *named != "none");
-    named.map(|digest| parse::<Sha256>("--fallback", digest)).transpose()
-}
-
 /// Returns the rights that the manifests of a revision and of its fallback ask for.
 fn grants<'m>(manifests: impl Iterator<Item = &'m Manifest>) -> Grants {
     let mut grants = Grants::default();
@@ -266,6 +305,31 @@ fn grants<'m>(manifests: impl Iterator<Item = &'m Manifest>) -> Grants {
     grants.models.sort();
     grants.models.dedup();
     grants
+}
+
+/// Refuses a revision that vehicles refuse, since they have accepted a newer one.
+fn check_order(revision: &Revision, former: Option<&Former>) -> Result<(), Failure> {
+    let newest = former.and_then(Former::revision).map_or(0, |newest| newest.release);
+    if revision.release >= newest {
+        return Ok(());
+    }
+    let Revision { name, release, .. } = revision;
+    let message =
+        format!("`{name}` has release {release}, and release {newest} was deployed before");
+    Err(Failure::new(Exit::Usage, message)
+        .with_help("publish this build with a higher one: `gleaner publish DIR --release N`"))
+}
+
+/// Refuses a name with two values: the first one would be lost.
+fn check_once(option: &str, assignments: &[String]) -> Result<(), Failure> {
+    let name = |text: &String| text.split('=').next().unwrap_or_default().to_owned();
+    let mut names: Vec<_> = assignments.iter().map(name).collect();
+    names.sort_unstable();
+    let twice = names.windows(2).find(|pair| pair[0] == pair[1]);
+    twice.map_or(Ok(()), |pair| {
+        let message = format!("`{option}` has two values for `{}`", visible(&pair[0]));
+        Err(Failure::new(Exit::Usage, message).with_help("name it once"))
+    })
 }
 
 fn config(manifest: &Manifest, set: &[String]) -> Result<BTreeMap<ItemName, ConfigValue>, Failure> {
@@ -292,10 +356,6 @@ fn parse<T: FromStr>(option: &str, text: &str) -> Result<T, Failure> {
     })
 }
 
-fn now() -> u64 {
-    SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs()
-}
-
 /// Waits until the lambda runs, for the attempt or a later one.
 fn wait(
     client: &VehicleClient,
@@ -311,9 +371,8 @@ fn wait(
             return Err(Failure::new(Exit::Differs, format!("deployment `{id}` is gone")));
         };
         if let Some(refused) = &deployment.refused {
-            let mut failure = Failure::new(Exit::Denied, format!("deployment `{id}` is refused"));
-            failure.causes = vec![refused.clone()];
-            return Err(failure);
+            let failure = Failure::new(Exit::Denied, format!("deployment `{id}` is refused"));
+            return Err(Failure { causes: vec![refused.clone()], ..failure });
         }
         // Of a fallback that is about to start, the attempt is a later one.
         let attempt = requested.max(deployment.attempt);
@@ -326,11 +385,9 @@ fn wait(
                 return running(args, deployment, started.elapsed(), has_failed);
             }
             Some(LambdaPhase::Quarantined) => {
-                let mut failure = Failure::new(
-                    Exit::LambdaFaulted,
-                    format!("deployment `{id}` does not run, and is not started again"),
-                );
-                failure.causes = lambda.and_then(|it| it.last_end.clone()).into_iter().collect();
+                let message = format!("deployment `{id}` does not run, and is not started again");
+                let causes = lambda.and_then(|it| it.last_end.clone()).into_iter().collect();
+                let failure = Failure { causes, ..Failure::new(Exit::LambdaFaulted, message) };
                 return Err(failure.with_help(format!(
                     "repair the lambda and deploy it again, or `gleaner start {id}`; \
                      `gleaner logs {id}` shows its log"
@@ -341,12 +398,10 @@ fn wait(
         if started.elapsed() >= timeout {
             let seconds = format_duration(timeout);
             let message = format!("deployment `{id}` does not run after {seconds}");
-            let mut failure = Failure::new(Exit::Differs, message);
-            failure.causes =
-                lambda.map(|it| format!("it is {}", it.phase.as_str())).into_iter().collect();
-            return Err(
-                failure.with_help("it goes on: `gleaner status` and `gleaner events` show it")
-            );
+            let phase = lambda.map(|it| format!("it is {}", it.phase.as_str()));
+            let causes = phase.into_iter().collect();
+            return Err(Failure { causes, ..Failure::new(Exit::Differs, message) }
+                .with_help("it goes on: `gleaner status` and `gleaner events` show it"));
         }
         thread::sleep(POLL_INTERVAL);
     }
@@ -364,25 +419,25 @@ fn running(
     let fallback = fallback.as_ref().filter(|_| *runs_fallback);
     let version = &fallback.unwrap_or(revision).version;
     let reason = failed.as_deref().filter(|_| fallback.is_some());
-    if args.json {
-        print(&json_line(deployment))?;
-    }
-    match reason {
-        Some(reason) if has_failed => {
+    let text = match reason {
+        Some(reason) => format!("running its fallback {version}: {}\n", in_one_line(reason)),
+        None => format!("running {version} after {} ms\n", after.as_millis()),
+    };
+    match reason.filter(|_| has_failed) {
+        None => show(args.json, deployment, |_| text),
+        Some(reason) => {
+            if args.json {
+                print_json(deployment)?;
+            }
             let message = format!("deployment `{id}` runs its fallback {version}");
-            let mut failure = Failure::new(Exit::LambdaFaulted, message);
-            failure.causes = vec![format!("{} failed: {reason}", revision.version)];
+            let causes = vec![format!("{} failed: {reason}", revision.version)];
             let help = "repair the lambda and deploy it again";
-            return Err(failure.with_help(format!("{help}; `gleaner logs {id}` shows its log")));
+            Err(Failure { causes, ..Failure::new(Exit::LambdaFaulted, message) }
+                .with_help(format!("{help}; `gleaner logs {id}` shows its log")))
         }
-        _ if args.json => {}
-        Some(reason) => print(&format!("running its fallback {version}: {reason}\n"))?,
-        None => print(&format!("running {version} after {} ms\n", after.as_millis()))?,
     }
-    Ok(Exit::Ok)
 }
 
-/// Waits until the lambda of a deployment has ended.
 fn wait_for_end(client: &VehicleClient, args: &ChangeArgs, done: &str) -> Result<Exit, Failure> {
     let started = Instant::now();
     loop {
@@ -394,13 +449,11 @@ fn wait_for_end(client: &VehicleClient, args: &ChangeArgs, done: &str) -> Result
             .as_ref()
             .map(|supervisor| supervisor.lambdas.iter().all(|lambda| lambda.id != args.id));
         if has_ended == Some(true) {
-            let text = match (args.vehicle.json, deployment) {
-                (true, Some(deployment)) => json_line(deployment),
-                (true, None) => json_line(&json!({ "id": args.id, "removed": true })),
-                (false, _) => format!("{done} `{}`\n", args.id),
+            let result = match deployment {
+                Some(deployment) => json!(deployment),
+                None => json!({ "id": args.id, "removed": true }),
             };
-            print(&text)?;
-            return Ok(Exit::Ok);
+            return show(args.vehicle.json, &result, |_| format!("{done} `{}`\n", args.id));
         }
         if started.elapsed() >= args.timeout {
             let id = &args.id;
@@ -408,9 +461,9 @@ fn wait_for_end(client: &VehicleClient, args: &ChangeArgs, done: &str) -> Result
                 Some(_) => Failure::new(Exit::Differs, format!("`{id}` still ends")),
                 None => {
                     let message = format!("{done} `{id}`, but whether it has ended is unknown");
-                    let mut failure = Failure::new(Exit::Unreachable, message);
-                    failure.causes = vec!["the supervisor does not report".to_owned()];
-                    failure.with_help("see `gleaner events`")
+                    let causes = vec!["the supervisor does not report".to_owned()];
+                    Failure { causes, ..Failure::new(Exit::Unreachable, message) }
+                        .with_help("see `gleaner events`")
                 }
             });
         }

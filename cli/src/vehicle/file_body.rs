@@ -8,7 +8,6 @@ use std::task::{Context, Poll};
 use bytes::Bytes;
 use hyper::body::{Body, Frame};
 
-/// Length of a piece.
 const PIECE: usize = 256 << 10;
 
 /// The body. Reading waits for the disk, which nothing else shares in a command.

@@ -3,17 +3,18 @@
 
 use std::collections::BTreeMap;
 
-use gleaner_base::{Exit, Failure, PlainFile, visible};
+use gleaner_base::{Exit, Failure, visible};
 use gleaner_lambda::Manifest;
-use gleaner_lambda::manifest::{ConfigValue, ItemName, LambdaName, Sha256};
+use gleaner_lambda::manifest::{ConfigValue, ItemName, LambdaName, MANIFEST_FILE, Sha256};
 use gleaner_protocol::vehicle_api::{DeploymentEnvelopes, RevisionEnvelope};
 use gleaner_trust::{
-    Deployment, Floors, Grants, Payload, PublicKey, Revision, SecretKey, TrustRoot,
-    deployment_of_keys, first_root, revision_of_digest, sha256,
+    Deployment, Floors, Grants, PublicKey, Revision, SecretKey, deployment_of_keys, first_root,
+    revision_of_digest, sha256,
 };
 
 use super::client::VehicleClient;
 use super::deploy::path;
+use super::trust::read;
 use crate::args::DeployArgs;
 
 /// A deployment that was verified by the keys of deployers.
@@ -92,7 +93,7 @@ impl Former {
             let RevisionEnvelope { envelope, manifest } =
                 parts.revisions.get(index).ok_or_else(lacks)?;
             let revision = revision_of_digest(envelope.as_bytes(), digest).map_err(refused)?;
-            let file = revision.files.iter().find(|file| file.path.as_str() == "lambda.toml");
+            let file = revision.files.iter().find(|file| file.path.as_str() == MANIFEST_FILE);
             if file.is_none_or(|file| file.sha256 != sha256(manifest.as_bytes())) {
                 let message = format!("another manifest than that of revision {digest} was sent");
                 return Err(Failure::new(Exit::Denied, message));
@@ -100,18 +101,24 @@ impl Former {
             if revision.name != *lambda {
                 return Err(other("lambda", revision.name.as_str()));
             }
-            let manifest = Manifest::parse(manifest, "lambda.toml")?;
+            let manifest = Manifest::parse(manifest, MANIFEST_FILE)?;
             revisions.push(FormerRevision { digest: digest.clone(), revision, manifest });
         }
         Ok(Self { deployment, revisions })
     }
 
-    /// Returns the fallback of the next deployment: its revision, or its fallback if that
-    /// `has_failed`.
-    fn runs(&self, has_failed: bool) -> Option<Fallback<'_>> {
-        let fallback = self.revisions.get(1).filter(|_| has_failed);
-        let runs = fallback.or_else(|| self.revisions.first())?;
+    /// Returns the fallback of the next deployment: its revision, or its fallback if that has
+    /// `failed` on a vehicle; none without one if it has failed on `all`.
+    fn runs(&self, (failed, all): (u64, u64)) -> Option<Fallback<'_>> {
+        let fallback = self.revisions.get(1).filter(|_| failed > 0);
+        let revision = self.revisions.first().filter(|_| failed == 0 || failed < all);
+        let runs = fallback.or(revision)?;
         Some(Fallback { digest: &runs.digest, known: Some(runs) })
+    }
+
+    /// Returns its revision.
+    pub(crate) fn revision(&self) -> Option<&Revision> {
+        self.revisions.first().map(|it| &it.revision)
     }
 
     fn find(&self, digest: &Sha256) -> Option<&FormerRevision> {
@@ -125,7 +132,7 @@ impl<'f> Fallback<'f> {
     pub(crate) fn choose(
         args: &DeployArgs,
         named: Option<&'f Sha256>,
-        (former, has_failed): (Option<&'f Former>, bool),
+        (former, failed): (Option<&'f Former>, (u64, u64)),
         digest: &Sha256,
     ) -> Option<Self> {
         let chosen = match (args.fallback.as_deref(), named) {
@@ -134,7 +141,12 @@ impl<'f> Fallback<'f> {
                 let known = former.and_then(|former| former.find(digest));
                 Some(Self { digest, known })
             }
-            (_, None) => former.and_then(|former| former.runs(has_failed)),
+            (_, None) => former.and_then(|former| {
+                let runs = former.runs(failed).filter(|it| it.digest != digest);
+                // Of the same revision, such as with another config, the fallback stays.
+                let own = former.revisions.get(1);
+                runs.or_else(|| own.map(|it| Self { digest: &it.digest, known: Some(it) }))
+            }),
         };
         chosen.filter(|chosen| chosen.digest != digest)
     }
@@ -161,11 +173,8 @@ pub(crate) fn changes(
     former: Option<&Former>,
     fallback: Option<Fallback<'_>>,
 ) -> Vec<String> {
-    let mut lines = Vec::new();
-    match fallback {
-        Some(fallback) => lines.push(format!("fallback: {}", fallback.in_words())),
-        None => lines.push("fallback: none".to_owned()),
-    }
+    let fallback = fallback.map_or_else(|| "none".to_owned(), Fallback::in_words);
+    let mut lines = vec![format!("fallback: {fallback}")];
     let (empty, none) = (Grants::default(), BTreeMap::new());
     let (granted, config) = former
         .map_or((&empty, &none), |former| (&former.deployment.grants, &former.deployment.config));
@@ -208,11 +217,7 @@ fn rights(grants: &Grants) -> Vec<String> {
 
 /// Returns the keys of the deployers of a trust root.
 fn deployers(file: &std::path::Path) -> Result<Vec<PublicKey>, Failure> {
-    let read = PlainFile::named(file, TrustRoot::MAX).and_then(PlainFile::read_whole);
-    let bytes = read.map_err(|error| {
-        Failure::caused_by(Exit::Usage, format!("cannot read `{}`", file.display()), &error)
-    })?;
-    let root = first_root(&bytes, &Floors::default()).map_err(|refusal| {
+    let root = first_root(&read(file)?, &Floors::default()).map_err(|refusal| {
         Failure::because(format!("cannot use `{}`", file.display()), &refusal)
     })?;
     Ok(root.deployers.into_iter().map(|scoped| scoped.key).collect())

@@ -16,11 +16,8 @@ mod top;
 mod trust;
 
 pub(crate) use client::VehicleClient;
-pub(crate) use deploy::{
-    LocalRevision, change, deploy, deployment, named_fallback, path, print_lines, remove,
-};
-pub(crate) use former::{Fallback, Former, changes};
-pub(crate) use status::{cloud_line, status};
+pub(crate) use deploy::{LocalRevision, change, deploy, path, print_lines, remove};
+pub(crate) use status::{cloud_line, labels_in_words, short, status};
 pub(crate) use stream::{events, logs, record_text};
 pub(crate) use top::top;
 pub(crate) use trust::trust;

@@ -1,5 +1,6 @@
 //! `gleaner status`: what runs on a vehicle.
 
+use std::collections::BTreeMap;
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -12,8 +13,8 @@ use gleaner_report::format::{counted, grouped, size};
 
 use super::client::VehicleClient;
 use crate::args::StatusArgs;
-use crate::render::{Paint, json_line, table};
-use crate::stdout::print;
+use crate::output::show;
+use crate::render::{Paint, or_dash, table};
 
 /// Age of a status from which a newer one is waited for, in s, and the longest wait.
 const FRESH_S: f64 = 2.0;
@@ -24,7 +25,7 @@ pub(super) const NO_DEPLOYMENTS: &str =
     "nothing is deployed: `gleaner deploy --local DIR --key FILE`";
 
 pub(crate) fn status(args: &StatusArgs) -> Result<Exit, Failure> {
-    let client = VehicleClient::of(&args.vehicle, &args.on)?;
+    let client = VehicleClient::of(args)?;
     let mut status = client.status()?;
     // The first request lets a connected vehicle report at once.
     let (started, first) = (Instant::now(), status.age_s);
@@ -35,18 +36,12 @@ pub(crate) fn status(args: &StatusArgs) -> Result<Exit, Failure> {
             break;
         }
     }
-    print(&match args.vehicle.json {
-        true => json_line(&status),
-        false => text(&status, Paint::of_stdout()),
-    })?;
-    Ok(Exit::Ok)
+    show(args.vehicle.json, &status, |status| text(status, Paint::of_stdout()))
 }
 
 pub(super) fn text(status: &VehicleStatus, paint: Paint) -> String {
-    let labels = status.labels.iter();
-    let labels = labels.map(|(name, value)| format!("{}={}", visible(name), visible(value)));
-    let labels = labels.collect::<Vec<_>>().join(" ");
-    let mut text = format!("{} {}\n", paint.bold(&visible(&status.vehicle)), paint.dim(&labels));
+    let (vehicle, labels) = (visible(&status.vehicle), labels_in_words(&status.labels));
+    let mut text = format!("{} {}\n", paint.bold(&vehicle), paint.dim(&labels));
     if let Some(age) = age(status) {
         text += &format!("  as of {age}\n");
     }
@@ -86,10 +81,8 @@ pub(super) fn text(status: &VehicleStatus, paint: Paint) -> String {
         "id", "lambda", "runs", "state", "for", "restarts", "wakes", "triggers", "faults", "p99",
         "memory",
     ];
-    let rows = status.deployments.iter().map(row);
-    let rows = std::iter::once(head.map(str::to_owned)).chain(rows);
     text += "\n";
-    text += &table(rows.collect(), &[5, 6, 7, 8, 9, 10]);
+    text += &table(&head, status.deployments.iter().map(row), &[5, 6, 7, 8, 9, 10]);
     for deployment in &status.deployments {
         text += &format!("{}\n", paint.dim(&content(deployment)));
         for reason in reasons(deployment) {
@@ -98,6 +91,15 @@ pub(super) fn text(status: &VehicleStatus, paint: Paint) -> String {
         }
     }
     text
+}
+
+pub(crate) fn labels_in_words(labels: &BTreeMap<String, String>) -> String {
+    let labels = labels.iter().map(|(name, value)| format!("{}={}", visible(name), visible(value)));
+    labels.collect::<Vec<_>>().join(" ")
+}
+
+pub(crate) fn short(digest: &str) -> String {
+    visible(&digest.chars().take(12).collect::<String>())
 }
 
 /// Formats the age of a status that a cloud has.
@@ -114,13 +116,14 @@ pub(crate) fn cloud_line(status: Option<&CloudStatus>, paint: Paint) -> String {
         "refused" => paint.red("refused"),
         state => paint.yellow(&visible(state)),
     };
-    let reason = status.reason.iter().map(|reason| format!(": {}", visible(reason)));
+    let reason = status.reason.iter().map(|reason| format!(": {}", in_one_line(reason)));
+    let help = status.help.iter().map(|help| format!(". {}", in_one_line(help)));
     let since = Duration::from_secs(status.since_s.max(0.0) as u64);
     format!(
         "  cloud {} {state} for {}{}; {} not sent, certificate until {}\n",
         visible(&status.address),
         format_duration(since),
-        reason.collect::<String>(),
+        reason.chain(help).collect::<String>(),
         counted(status.unsent, "record"),
         UtcTime::of(status.certificate_expires.try_into().unwrap_or(i64::MAX)),
     )
@@ -134,7 +137,6 @@ pub(super) fn shared(capacity: &Capacity) -> String {
     format!("{} {asked} of {most} asked for{used}", visible(&capacity.resource))
 }
 
-/// Formats an amount of a resource.
 fn amount(number: f64, unit: &str) -> String {
     match unit {
         "B" => size(number as u64),
@@ -161,7 +163,6 @@ pub(super) fn version(deployment: &DeploymentStatus) -> String {
 /// Returns what was signed, and runs: deployments of one number differ by their digests.
 fn content(deployment: &DeploymentStatus) -> String {
     let DeploymentStatus { id, release, envelope, revision, fallback, config, .. } = deployment;
-    let short = |digest: &str| visible(&digest.chars().take(12).collect::<String>());
     let runs = fallback.as_ref().filter(|_| deployment.runs_fallback).unwrap_or(revision);
     let set = config.iter().map(|(name, value)| format!(" {}={}", visible(name), visible(value)));
     format!(
@@ -216,19 +217,18 @@ fn row(deployment: &DeploymentStatus) -> [String; 11] {
     let lambda = deployment.status.as_ref();
     let seconds = lambda.map(|lambda| Duration::from_secs(lambda.phase_s as u64));
     let live = lambda.and_then(|lambda| lambda.live.as_deref());
-    let count = |count: Option<u64>| count.map_or_else(|| "-".to_owned(), grouped);
     let latency = live.and_then(|live| live.wake_latency);
     [
         visible(&deployment.id),
         visible(&deployment.lambda),
         version(deployment),
         state(deployment).to_owned(),
-        seconds.map_or_else(|| "-".to_owned(), format_duration),
-        count(lambda.map(|lambda| lambda.restarts.into())),
-        count(live.map(|live| live.wakes)),
-        count(live.map(|live| live.triggers)),
-        count(live.map(|live| live.faults)),
-        latency.map_or_else(|| "-".to_owned(), |it| format!("{:.2} ms", it.p99_ns as f64 / 1e6)),
-        live.map_or_else(|| "-".to_owned(), |live| size(live.rss_bytes)),
+        or_dash(seconds, format_duration),
+        or_dash(lambda, |lambda| grouped(lambda.restarts)),
+        or_dash(live, |live| grouped(live.wakes)),
+        or_dash(live, |live| grouped(live.triggers)),
+        or_dash(live, |live| grouped(live.faults)),
+        or_dash(latency, |it| format!("{:.2} ms", it.p99_ns as f64 / 1e6)),
+        or_dash(live, |live| size(live.rss_bytes)),
     ]
 }

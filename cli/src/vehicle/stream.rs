@@ -1,63 +1,133 @@
 //! `gleaner logs` and `gleaner events`: print records of a vehicle.
 
-use std::time::SystemTime;
-
-use gleaner_base::{Exit, Failure, UtcTime, in_one_line, nanoseconds, visible};
+use gleaner_base::text::list;
+use gleaner_base::{Exit, Failure, UtcTime, in_one_line, visible};
 use gleaner_protocol::vehicle_api::StreamLine;
 use serde_json::Value;
 
 use super::client::VehicleClient;
+use super::deploy::checked_id;
 use crate::args::{LogsArgs, StreamArgs};
-use crate::render::{Paint, time_of_day};
-use crate::stdout::{end_with_reader, print};
+use crate::output::{end_with_reader, print, print_json};
+use crate::render::Paint;
+
+/// Length of records, as JSON, that are kept in memory to sort them; a longer list is sorted in
+/// parts.
+const SORTED_MAX: usize = 64 << 20;
 
 pub(crate) fn logs(args: &LogsArgs) -> Result<Exit, Failure> {
-    if args.id.parse::<gleaner_lambda::manifest::ItemName>().is_err() {
-        let id = gleaner_base::excerpt(&args.id);
-        return Err(Failure::new(Exit::Usage, format!("`{id}` is no id of a deployment"))
-            .with_help("`gleaner status` lists them"));
+    let path = format!("/v1/lambdas/{}/records", checked_id(&args.id)?);
+    let client = VehicleClient::of(&args.stream.source)?;
+    // The records of a removed deployment stay for a while.
+    let check = || check_deployed(&client, &args.id);
+    let shows_none = args.stream.follow || args.stream.last == 0;
+    if shows_none && is_empty(&client, &path)? {
+        check()?;
     }
-    show(&format!("/v1/lambdas/{}/records", args.id), &args.stream)
+    let count = show(&client, &path, &args.stream)?;
+    if count == 0 && !shows_none {
+        check()?;
+    }
+    Ok(Exit::Ok)
 }
 
 pub(crate) fn events(args: &StreamArgs) -> Result<Exit, Failure> {
-    show("/v1/events", args)
+    show(&VehicleClient::of(&args.source)?, "/v1/events", args).map(|_| Exit::Ok)
 }
 
-fn show(path: &str, args: &StreamArgs) -> Result<Exit, Failure> {
-    let client = VehicleClient::of(&args.vehicle, &args.on)?;
+/// Refuses the id of a deployment that the vehicle does not have.
+fn check_deployed(client: &VehicleClient, id: &str) -> Result<(), Failure> {
+    let ids: Vec<_> = client.status()?.deployments.into_iter().map(|it| visible(&it.id)).collect();
+    if ids.iter().any(|it| it == id) {
+        return Ok(());
+    }
+    let message = format!("there is no deployment `{id}`, and no record of one");
+    let help = match ids.is_empty() {
+        true => "nothing is deployed there".to_owned(),
+        false => format!("the deployments are {}", list(&ids, "and")),
+    };
+    Err(Failure::new(Exit::Usage, message).with_help(help))
+}
+
+fn is_empty(client: &VehicleClient, path: &str) -> Result<bool, Failure> {
+    let mut is_empty = true;
+    client.lines(&format!("{path}?last=1&follow=false"), |_| {
+        is_empty = false;
+        Ok(())
+    })?;
+    Ok(is_empty)
+}
+
+/// Records that are printed in order.
+#[derive(Default)]
+struct ListedRecords {
+    /// Identities of starts of the machine, in the order in which their first records came.
+    boots: Vec<String>,
+    /// Each with the index of its start, and the time since it.
+    lines: Vec<((usize, u64), StreamLine)>,
+    bytes: usize,
+}
+
+impl ListedRecords {
+    fn add(&mut self, line: StreamLine, bytes: usize) {
+        // The time of day may have been set meanwhile. A gap has no time: it stays where it is.
+        let before = self.lines.last().map(|(place, _)| *place).unwrap_or_default();
+        let known = self.boots.iter().position(|boot| *boot == line.boot);
+        let place = match (line.boot.is_empty(), known) {
+            (true, _) => before,
+            (false, Some(boot)) => (boot, line.boot_ns),
+            (false, None) => {
+                self.boots.push(line.boot.clone());
+                (self.boots.len() - 1, line.boot_ns)
+            }
+        };
+        self.lines.push((place, line));
+        self.bytes += bytes;
+    }
+
+    fn print(&mut self, paint: Paint) -> Result<(), Failure> {
+        self.lines.sort_by_key(|(place, _)| *place);
+        self.bytes = 0;
+        self.lines.drain(..).try_for_each(|(_, line)| print(&record_text(&line, paint)))
+    }
+}
+
+/// Prints records; returns their number. A list is sorted by starts of the machine and the time
+/// since each; records that are followed, and JSON for programs, come as they arrived.
+fn show(client: &VehicleClient, path: &str, args: &StreamArgs) -> Result<u64, Failure> {
     let path = format!("{path}?last={}&follow={}", args.last, args.follow);
     let paint = Paint::of_stdout();
     if args.follow {
         end_with_reader();
     }
-    client.lines(&path, |line| {
-        if args.vehicle.json {
-            return print(&format!("{line}\n"));
+    let (mut listed, mut count) = (ListedRecords::default(), 0);
+    let read = client.lines(&path, |text| {
+        let failed = |error: serde_json::Error| {
+            Failure::caused_by(Exit::Internal, "cannot parse a record", &error)
+        };
+        count += 1;
+        if args.source.vehicle.json {
+            return print_json(&serde_json::from_str::<Value>(text).map_err(failed)?).map(drop);
         }
-        let line: StreamLine = serde_json::from_str(line)
-            .map_err(|error| Failure::caused_by(Exit::Internal, "cannot parse a record", &error))?;
-        print(&record_text(&line, paint))
-    })?;
-    Ok(Exit::Ok)
+        let line: StreamLine = serde_json::from_str(text).map_err(failed)?;
+        if args.follow {
+            return print(&record_text(&line, paint));
+        }
+        listed.add(line, text.len());
+        if listed.bytes > SORTED_MAX { listed.print(paint) } else { Ok(()) }
+    });
+    listed.print(paint)?;
+    let ended = Failure::new(Exit::Unreachable, "the stream has ended");
+    let ended = ended.with_help("start this command again to follow it further");
+    read.and(if args.follow { Err(ended) } else { Ok(count) })
 }
 
-/// Formats a record as a line, with its date unless that is today.
 pub(crate) fn record_text(line: &StreamLine, paint: Paint) -> String {
-    let since_1970 = SystemTime::UNIX_EPOCH.elapsed().unwrap_or_default();
-    text(line, &date(nanoseconds(since_1970)), paint)
-}
-
-/// Formats a record as a line, with its date unless that is `today`.
-fn text(line: &StreamLine, today: &str, paint: Paint) -> String {
     let record = &line.record;
     let field = |name: &str| record.get(name).and_then(Value::as_str).map(visible);
     let time = match line.time_ns {
-        0 => "--:--:--.---".to_owned(),
-        time => match date(time) {
-            day if day == *today => time_of_day(time),
-            day => format!("{day} {}", time_of_day(time)),
-        },
+        0 => format!("{:24}", "no time"),
+        time_ns => time(time_ns),
     };
     let kind = field("event").unwrap_or_else(|| visible(&line.kind));
     let lambda = field("lambda").map(|it| format!("{it}: ")).unwrap_or_default();
@@ -121,10 +191,11 @@ fn gap_words(first: u64, record: &Value) -> String {
     format!("records {first} to {last} are missing: {reason}")
 }
 
-/// Returns the day of a time, in UTC.
-fn date(time_ns: i64) -> String {
-    let text = UtcTime::of(time_ns.div_euclid(1_000_000_000)).to_string();
-    text.split('T').next().unwrap_or_default().to_owned()
+/// Formats a time in the form of RFC 3339, in UTC, with ms.
+fn time(time_ns: i64) -> String {
+    let seconds = UtcTime::of(time_ns.div_euclid(1_000_000_000)).to_string();
+    let ms = time_ns.rem_euclid(1_000_000_000) / 1_000_000;
+    format!("{}.{ms:03}Z", seconds.trim_end_matches('Z'))
 }
 
 #[cfg(test)]
@@ -137,23 +208,21 @@ mod tests {
         let stream = "a".to_owned();
         let (kind, boot) = (kind.to_owned(), String::new());
         let line = StreamLine { stream, seq: 7, time_ns, boot_ns: 0, boot, kind, record };
-        text(&line, "2018-08-02", Paint::new(false))
+        record_text(&line, Paint::new(false))
     }
 
     #[test]
-    fn a_record_of_another_day_has_its_date() {
-        let event = || json!({ "event": "ready", "lambda": "a", "text": "ready" });
-        let now = 1_533_199_491_136_000_000;
-        assert_eq!(shown(now, "event", event()), "08:44:51.136 ready        a: ready\n");
-        let before = shown(now - 86_400_000_000_000, "event", event());
-        assert_eq!(before, "2018-08-01 08:44:51.136 ready        a: ready\n");
+    fn a_record_has_its_date_and_zone() {
+        let event = json!({ "event": "ready", "lambda": "a", "text": "ready" });
+        let line = shown(1_533_199_491_136_000_000, "event", event);
+        assert_eq!(line, "2018-08-02T08:44:51.136Z ready        a: ready\n");
     }
 
     #[test]
     fn a_gap_has_both_numbers_and_the_reason() {
         let gap = shown(0, "gap", json!({ "to": 9, "reason": "DiskFull" }));
         let expected = "records 7 to 9 are missing: the disk was full\n";
-        assert_eq!(gap, format!("--:--:--.--- gap          {expected}"));
+        assert_eq!(gap, format!("no time                  gap          {expected}"));
     }
 
     #[test]

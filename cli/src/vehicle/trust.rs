@@ -1,7 +1,6 @@
 //! `gleaner trust`: signs and installs trust roots.
 
 use std::path::Path;
-use std::time::{SystemTime, UNIX_EPOCH};
 
 use gleaner_base::{Exit, Failure, PlainFile, write_atomically};
 use gleaner_trust::{
@@ -12,8 +11,8 @@ use serde_json::json;
 
 use super::client::VehicleClient;
 use crate::args::{TrustArgs, TrustCommand, TrustInstallArgs};
-use crate::render::json_line;
-use crate::stdout::print;
+use crate::output::show;
+use crate::since_1970;
 
 pub(crate) fn trust(command: &TrustCommand) -> Result<Exit, Failure> {
     match command {
@@ -29,7 +28,7 @@ fn new(args: &TrustArgs) -> Result<Exit, Failure> {
     let before = args.after.as_ref().map(|path| read(path)).transpose()?;
     let opened = before.as_ref().map(|it| first_root(it, &Floors::default())).transpose();
     let current = opened.map_err(|it| Failure::because("cannot use the former trust root", &it))?;
-    let created = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs();
+    let created = since_1970().as_secs();
     let root = TrustRoot {
         version: current.as_ref().map_or(0, |current| current.version) + 1,
         created,
@@ -54,25 +53,20 @@ fn new(args: &TrustArgs) -> Result<Exit, Failure> {
         Failure::caused_by(Exit::Usage, format!("cannot write `{}`", args.file.display()), &error)
     })?;
     let (file, version) = (args.file.display(), root.version);
-    print(&match args.json {
-        true => json_line(&json!({ "file": file.to_string(), "version": version })),
-        false => format!("signed {file} (trust root {version})\n"),
-    })?;
-    Ok(Exit::Ok)
+    show(args.json, &json!({ "file": file.to_string(), "version": version }), |_| {
+        format!("signed {file} (trust root {version})\n")
+    })
 }
 
 fn install(args: &TrustInstallArgs) -> Result<Exit, Failure> {
     let client = VehicleClient::new(&args.vehicle)?;
     client.put("/v1/trust", read(&args.file)?)?;
-    let trust = client.status()?.trust;
-    print(&match args.vehicle.json {
-        true => json_line(&trust),
-        false => format!("installed trust root {}\n", trust.map_or(0, |trust| trust.version)),
-    })?;
-    Ok(Exit::Ok)
+    show(args.vehicle.json, &client.status()?.trust, |trust| {
+        format!("installed trust root {}\n", trust.as_ref().map_or(0, |trust| trust.version))
+    })
 }
 
-fn read(path: &Path) -> Result<Vec<u8>, Failure> {
+pub(super) fn read(path: &Path) -> Result<Vec<u8>, Failure> {
     PlainFile::named(path, TrustRoot::MAX).and_then(PlainFile::read_whole).map_err(|error| {
         Failure::caused_by(Exit::Usage, format!("cannot read `{}`", path.display()), &error)
             .with_help("`gleaner trust new FILE` signs one")

@@ -39,6 +39,28 @@ pub fn done(command: &mut Command) -> String {
     String::from_utf8(stdout).unwrap()
 }
 
+/// The program `gleaner`, started in a folder.
+pub fn gleaner(folder: &Path, arguments: &[&str]) -> Command {
+    let mut gleaner = Command::new(env!("CARGO_BIN_EXE_gleaner"));
+    gleaner.current_dir(folder).args(arguments).stdin(Stdio::null());
+    gleaner
+}
+
+/// Runs a program that must fail with `code`, and returns its message.
+#[track_caller]
+pub fn fails(mut command: Command, code: i32) -> String {
+    failed(output(&mut command), code)
+}
+
+/// Returns the message of a program that must have failed with `code`.
+#[track_caller]
+pub fn failed(Output { status, stderr, .. }: Output, code: i32) -> String {
+    let text = String::from_utf8(stderr).unwrap();
+    assert_eq!(status.code(), Some(code), "{text}");
+    assert!(text.starts_with("error: ") && text.contains("  help:  "), "{text}");
+    text
+}
+
 /// Returns a root that trusts a key, as `gleaner keys show --json` prints it, for all lambdas.
 pub fn trusting(shown: &str) -> TrustRoot {
     let shown: Value = serde_json::from_str(shown).unwrap();

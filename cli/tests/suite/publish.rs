@@ -3,7 +3,7 @@
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::path::PathBuf;
-use std::process::{Command, Output, Stdio};
+use std::process::{Command, Stdio};
 
 use gleaner_trust::{Floors, Labels, Revision, Verifier};
 use serde_json::Value;
@@ -36,9 +36,7 @@ impl Workplace {
     }
 
     fn command(&self, arguments: &[&str]) -> Command {
-        let mut gleaner = Command::new(env!("CARGO_BIN_EXE_gleaner"));
-        gleaner.current_dir(self.0.path()).args(arguments).stdin(Stdio::null());
-        gleaner
+        programs::gleaner(self.0.path(), arguments)
     }
 
     /// Runs a command that must succeed, and returns its output.
@@ -50,11 +48,9 @@ impl Workplace {
     /// Runs a command that must fail with `code`, and returns its message.
     #[track_caller]
     fn fails(&self, code: i32, arguments: &[&str]) -> String {
-        let Output { status, stdout, stderr } = programs::output(&mut self.command(arguments));
-        let text = String::from_utf8(stderr).unwrap();
-        assert_eq!((status.code(), stdout.len()), (Some(code), 0), "{text}");
-        assert!(text.starts_with("error: ") && text.contains("  help:  "), "{text}");
-        text
+        let output = programs::output(&mut self.command(arguments));
+        assert!(output.stdout.is_empty(), "{output:?}");
+        programs::failed(output, code)
     }
 
     /// Returns the revision as a vehicle reads it that trusts the key.

@@ -1,10 +1,11 @@
 //! Tests of the program `gleaner replay` with a script as runtime.
 
 use std::fs;
-use std::path::PathBuf;
-use std::process::{self, Command, Output, Stdio};
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
 
 use gleaner_protocol::ReplaySummary;
+use tempfile::TempDir;
 
 use crate::programs;
 
@@ -18,13 +19,13 @@ const DECISION: &str = concat!(
     r#""triggers":[{"kind":"event","label":"seen","score":0.5,"attributes":{}}],"fault":null,"fuel":1,"run_ns":2}"#
 );
 
-/// A folder with a script `gleaner-runtime`, removed when the test ends.
-struct Installation(PathBuf);
+/// A folder with a script `gleaner-runtime`.
+struct Installation(TempDir);
 
 impl Installation {
-    fn new(test: &str, runtime: &str) -> Installation {
-        let folder = std::env::temp_dir().join(format!("gleaner-replay-{}-{test}", process::id()));
-        fs::create_dir(&folder).unwrap();
+    fn new(runtime: &str) -> Installation {
+        let dir = tempfile::tempdir().unwrap();
+        let folder = dir.path();
         let report = SUMMARY
             .replacen('{', r#"{"report":"summary","#, 1)
             .replace("OUT", folder.to_str().unwrap());
@@ -34,7 +35,11 @@ impl Installation {
         fs::write(folder.join("decisions.jsonl"), format!("{DECISION}\n")).unwrap();
         let runtime = format!("#!/bin/sh\ncd '{}'\n{runtime}\n", folder.display());
         programs::script(&folder.join("gleaner-runtime"), &runtime);
-        Installation(folder)
+        Installation(dir)
+    }
+
+    fn path(&self) -> &Path {
+        self.0.path()
     }
 
     fn command(&self, arguments: &[&str]) -> Command {
@@ -42,21 +47,15 @@ impl Installation {
         // The folder is given here, since `gleaner` does not use the path in the summary.
         gleaner
             .args(["replay", "dir", "a.mcap", "--out"])
-            .arg(&self.0)
+            .arg(self.path())
             .args(arguments)
-            .env("GLEANER_HOME", &self.0)
+            .env("GLEANER_HOME", self.path())
             .stdin(Stdio::null());
         gleaner
     }
 
     fn replay(&self, arguments: &[&str]) -> Output {
         programs::output(&mut self.command(arguments))
-    }
-}
-
-impl Drop for Installation {
-    fn drop(&mut self) {
-        let _ = fs::remove_dir_all(&self.0);
     }
 }
 
@@ -67,7 +66,7 @@ fn text(bytes: &[u8]) -> &str {
 #[test]
 fn a_replay_ends_with_a_summary_and_without_colours_in_a_pipe() {
     let runtime = r#"echo '{"report":"progress","done":1,"total":2,"at_ns":5}'; cat report"#;
-    let output = Installation::new("summary", runtime).replay(&[]);
+    let output = Installation::new(runtime).replay(&[]);
     assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
     assert!(text(&output.stdout).starts_with(
         "x 0.1.0 (wasm): 1 trigger in 2 wakes, 3.0 s of drive\n     1.500 s  seen  0.5\n"
@@ -78,9 +77,9 @@ fn a_replay_ends_with_a_summary_and_without_colours_in_a_pipe() {
 
 #[test]
 fn json_is_the_summary_alone() {
-    let installation = Installation::new("json", "cat report");
+    let installation = Installation::new("cat report");
     let output = installation.replay(&["--json"]);
-    let expected = SUMMARY.replace("OUT", installation.0.to_str().unwrap());
+    let expected = SUMMARY.replace("OUT", installation.path().to_str().unwrap());
     let line = text(&output.stdout);
     assert!(line.ends_with("}\n") && line.lines().count() == 1, "{line}");
     // Counts that an older runtime lacks are 0.
@@ -92,8 +91,8 @@ fn json_is_the_summary_alone() {
 
 #[test]
 fn a_replay_writes_a_report_and_prints_its_path() {
-    let installation = Installation::new("page", "cat report");
-    let page = installation.0.join("report.html");
+    let installation = Installation::new("cat report");
+    let page = installation.path().join("report.html");
     let output = installation.replay(&[]);
     let stdout = text(&output.stdout);
     assert!(stdout.ends_with(&format!("  report: {}\n", page.display())), "{stdout}");
@@ -108,8 +107,8 @@ fn a_replay_writes_a_report_and_prints_its_path() {
 
 #[test]
 fn a_report_that_cannot_be_written_is_an_error_beside_the_results() {
-    let installation = Installation::new("no-page", "cat report; exit 6");
-    fs::create_dir(installation.0.join("report.html")).unwrap();
+    let installation = Installation::new("cat report; exit 6");
+    fs::create_dir(installation.path().join("report.html")).unwrap();
     let output = installation.replay(&[]);
     assert_eq!(output.status.code(), Some(6), "the exit code of the runtime");
     let stderr = text(&output.stderr);
@@ -122,17 +121,17 @@ fn a_report_that_cannot_be_written_is_an_error_beside_the_results() {
 
 #[test]
 fn exit_code_and_messages_of_the_runtime_are_passed_on() {
-    let output = Installation::new("fails", "echo 'error: no such drive' >&2; exit 2").replay(&[]);
+    let output = Installation::new("echo 'error: no such drive' >&2; exit 2").replay(&[]);
     assert_eq!(output.status.code(), Some(2));
     assert_eq!(text(&output.stderr), "error: no such drive\n");
-    let output = Installation::new("faulted", "cat report; exit 6").replay(&[]);
+    let output = Installation::new("cat report; exit 6").replay(&[]);
     assert_eq!(output.status.code(), Some(6));
     assert!(text(&output.stdout).contains("seen"));
 }
 
 #[test]
 fn a_killed_runtime_is_reported_with_help() {
-    let output = Installation::new("killed", "kill -9 $$").replay(&[]);
+    let output = Installation::new("kill -9 $$").replay(&[]);
     assert_eq!(output.status.code(), Some(1));
     let stderr = text(&output.stderr);
     assert!(stderr.starts_with(
@@ -147,26 +146,24 @@ const ORPHAN: &str = "(n=0; while [ -e report ] && [ $n -lt 300 ]; do sleep 0.1;
 
 #[test]
 fn a_process_left_running_does_not_delay_the_summary() {
-    let installation = Installation::new("orphan", &format!("{ORPHAN} cat report"));
+    let installation = Installation::new(&format!("{ORPHAN} cat report"));
     let output = installation.replay(&[]);
     assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
     assert!(text(&output.stdout).contains("seen"));
-    assert!(!installation.0.join("waited").exists());
+    assert!(!installation.path().join("waited").exists());
 }
 
 #[test]
 fn a_process_left_running_does_not_delay_a_failure() {
-    let installation =
-        Installation::new("orphan-fails", &format!("{ORPHAN} echo error: no >&2; exit 5"));
+    let installation = Installation::new(&format!("{ORPHAN} echo error: no >&2; exit 5"));
     assert_eq!(installation.replay(&[]).status.code(), Some(5));
-    assert!(!installation.0.join("waited").exists());
+    assert!(!installation.path().join("waited").exists());
 }
 
 #[test]
 fn a_runtime_of_another_version_is_stopped() {
     // The script never ends.
-    let output = Installation::new("version", r#"while echo '{"report":"weather"}'; do :; done"#)
-        .replay(&[]);
+    let output = Installation::new(r#"while echo '{"report":"weather"}'; do :; done"#).replay(&[]);
     assert_eq!(output.status.code(), Some(1));
     assert!(
         text(&output.stderr).contains("install the same version of gleaner and gleaner-runtime")
@@ -179,9 +176,7 @@ fn an_exit_code_without_an_error_message_is_not_trusted() {
     for (code, stderr) in
         [(0, ""), (3, ""), (6, ""), (3, "warning: an error: is near\n"), (101, "error: x\n")]
     {
-        let test = format!("unexplained-{code}-{}", stderr.len());
-        let output =
-            Installation::new(&test, &format!("printf '{stderr}' >&2; exit {code}")).replay(&[]);
+        let output = Installation::new(&format!("printf '{stderr}' >&2; exit {code}")).replay(&[]);
         assert_eq!(output.status.code(), Some(1));
         let ended = format!(
             "error: gleaner-runtime ended without a result (exit status: {code})\n  help:  code of a lambda "
@@ -193,7 +188,7 @@ fn an_exit_code_without_an_error_message_is_not_trusted() {
 
 #[test]
 fn a_crash_names_its_signal() {
-    let output = Installation::new("crash", "kill -11 $$").replay(&[]);
+    let output = Installation::new("kill -11 $$").replay(&[]);
     assert_eq!(output.status.code(), Some(1));
     let stderr = text(&output.stderr);
     assert!(stderr.contains("without a result (signal: 11 (SIGSEGV)"), "{stderr}");
@@ -201,7 +196,7 @@ fn a_crash_names_its_signal() {
 
 /// Runs `gleaner` with these arguments; `OUT` stands for the folder of `installation`.
 fn with_out(installation: &Installation, arguments: &[&str]) -> Output {
-    let out = installation.0.to_str().unwrap();
+    let out = installation.path().to_str().unwrap();
     let arguments =
         arguments.iter().map(|argument| if *argument == "OUT" { out } else { *argument });
     // A generous limit for a command that takes some milliseconds.
@@ -224,10 +219,7 @@ fn oversized_results_are_refused_with_their_name_and_bound() {
         ("summary.json", "4 MiB", &commands),
         ("signals.json", "32 MiB", &commands),
     ] {
-        let installation = Installation::new(
-            &format!("sparse-{name}"),
-            &format!("truncate -s 1T {name}; cat report"),
-        );
+        let installation = Installation::new(&format!("truncate -s 1T {name}; cat report"));
         let refused = format!("cause: it has 1099511627776 bytes; at most {bound} are read");
         let shown = installation.replay(&[]);
         let stderr = text(&shown.stderr);
@@ -250,11 +242,9 @@ fn oversized_results_are_refused_with_their_name_and_bound() {
 fn linked_results_are_not_shown() {
     let other = "the log of another lambda";
     for name in ["log.jsonl", "decisions.jsonl", "summary.json"] {
-        let installation = Installation::new(
-            &format!("link-{name}"),
-            &format!("echo '{other}' > other; ln -sf other {name}; cat report"),
-        );
-        let page = installation.0.join("report.html");
+        let installation =
+            Installation::new(&format!("echo '{other}' > other; ln -sf other {name}; cat report"));
+        let page = installation.path().join("report.html");
         installation.replay(&[]);
         let output = with_out(&installation, &["report", "OUT"]);
         let stderr = text(&output.stderr);
@@ -272,7 +262,7 @@ fn linked_results_are_not_shown() {
 #[cfg(target_os = "linux")]
 #[test]
 fn a_failing_standard_output_is_an_error() {
-    let installation = Installation::new("full", "cat report");
+    let installation = Installation::new("cat report");
     for arguments in [&[][..], &["--json"]] {
         let full = fs::File::options().write(true).open("/dev/full").unwrap();
         let mut replay = installation.command(arguments);
@@ -288,7 +278,7 @@ fn a_failing_standard_output_is_an_error() {
 
 #[test]
 fn a_value_without_an_equals_sign_is_refused_before_anything_starts() {
-    let output = Installation::new("refused", "touch started").replay(&["--set", "brake_mps2"]);
+    let output = Installation::new("touch started").replay(&["--set", "brake_mps2"]);
     assert_eq!(output.status.code(), Some(2));
     assert!(text(&output.stderr).contains("write KEY=VALUE"));
 }

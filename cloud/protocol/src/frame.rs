@@ -4,9 +4,10 @@ use std::cell::RefCell;
 use std::io::{self, Read};
 
 use prost::Message;
-use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use zstd::bulk::Decompressor;
+
+use crate::problem::WantedProblem;
 
 thread_local! {
     /// Decompresses parts one after the other in the same memory. Between what lives as long as a
@@ -97,8 +98,8 @@ pub struct Hello {
     /// Public key that verifies its clips.
     #[prost(string, tag = "3")]
     pub key: String,
-    /// Number of the newest wanted state of this cloud that it has followed: a cloud with a lower
-    /// one was restored from a backup.
+    /// Number of the newest wanted state of this cloud that it has received, also of one that it
+    /// could not apply: a cloud that has never sent this one was restored from a backup.
     #[prost(uint64, tag = "4")]
     pub followed: u64,
     /// Boot of its machine, as 32 hexadecimal digits: a machine never comes back to a former one.
@@ -198,55 +199,6 @@ pub struct Reported {
     /// The reasons why parts of the wanted state are not applied.
     #[prost(message, repeated, tag = "4")]
     pub problems: Vec<WantedProblem>,
-}
-
-/// The reason why a wanted deployment is not applied.
-#[derive(Clone, PartialEq, Eq, Hash, Message, Serialize, Deserialize)]
-#[serde(default)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
-pub struct WantedProblem {
-    /// Id of the deployment.
-    #[prost(string, tag = "1")]
-    pub deployment: String,
-    /// SHA-256 of its signed envelope.
-    #[prost(string, tag = "2")]
-    pub envelope: String,
-    /// The failed action.
-    #[prost(string, tag = "3")]
-    pub title: String,
-    /// True if the vehicle could not fetch it yet, and goes on by itself; false if it refuses it.
-    #[prost(bool, tag = "4")]
-    pub is_pending: bool,
-    /// The causes, the nearest first.
-    #[prost(string, repeated, tag = "5")]
-    pub causes: Vec<String>,
-    /// Help for the user; empty without any.
-    #[prost(string, tag = "6")]
-    pub help: String,
-}
-
-impl WantedProblem {
-    /// Returns the action and its causes in one line, safe to print.
-    pub fn in_words(&self) -> String {
-        let parts = std::iter::once(&self.title).chain(&self.causes);
-        parts.map(|part| gleaner_base::visible(part)).collect::<Vec<_>>().join(": ")
-    }
-
-    /// Shortens each text to so many characters, and the causes to so many, and escapes what is no
-    /// text to print.
-    pub fn bounded(&self, causes: usize, characters: usize) -> Self {
-        let short = |text: &String| {
-            gleaner_base::visible(&text.chars().take(characters).collect::<String>())
-        };
-        Self {
-            deployment: gleaner_base::excerpt(&self.deployment),
-            envelope: gleaner_base::excerpt(&self.envelope),
-            title: short(&self.title),
-            is_pending: self.is_pending,
-            causes: self.causes.iter().take(causes).map(short).collect(),
-            help: short(&self.help),
-        }
-    }
 }
 
 /// Records of a stream.

@@ -16,6 +16,7 @@ mod enrolment;
 mod frame;
 mod object;
 pub mod people;
+mod problem;
 pub mod records;
 pub mod waves;
 
@@ -25,7 +26,7 @@ pub use enrolment::{
 pub use frame::{
     Ack, Body, Cursor, Desired, FRAME_MAX, Frame, FrameError, GoAway, Hello, LINES_MAX, PROTOCOL,
     Ping, Pong, RECORDS_MAX, Records, Reported, STATUS_STREAM, STREAM_NAME_MAX, TAIL_S,
-    TAIL_STREAMS_MAX, Tail, WANTED_MAX, Wanted, WantedProblem, Welcome, compress, decompress,
-    desired_digest,
+    TAIL_STREAMS_MAX, Tail, WANTED_MAX, Wanted, Welcome, compress, decompress, desired_digest,
 };
 pub use object::{AnnouncedFile, UnfinishedFile};
+pub use problem::{CAUSES_MAX, PROBLEM_TEXT_MAX, PROBLEMS_MAX, WantedProblem, problem_text};

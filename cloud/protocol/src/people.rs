@@ -285,6 +285,9 @@ pub struct FleetDeployment {
     pub running: u64,
     /// Number of these that refuse it, or whose lambda has failed.
     pub failed: u64,
+    /// Number of the failed ones that run its fallback.
+    #[serde(default)]
+    pub on_fallback: u64,
     /// The progress of its waves; absent once the release is for all these vehicles.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub waves: Option<WaveProgress>,

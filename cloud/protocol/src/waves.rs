@@ -70,7 +70,7 @@ pub struct WaveProgress {
     pub since: u64,
     /// Number of vehicles that the waves have reached.
     pub vehicles: u64,
-    /// Number of these that run the release.
+    /// Number of these that run the release, and are connected or were so after the soak time.
     pub running: u64,
     /// Number of these that refuse it, or whose lambda has failed.
     pub failed: u64,

@@ -12,13 +12,12 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use fake::{FakeLink, FakeVehicle, Person};
+use fake::{FakeLink, FakeVehicle, Person, Signed};
 use gleaner_cloud::{CloudServer, ServeOptions};
 use gleaner_fleet::{Body, Desired, Ping, Records, Reported, Wanted, WantedProblem, compress};
 use gleaner_protocol::supervision::{LambdaPhase, LambdaStatus, ProcessStatus, SupervisorStatus};
 use gleaner_protocol::vehicle_api::{DeploymentStatus, RevisionStatus, VehicleStatus};
 use gleaner_protocol::{DurationStats, Layer, LiveStatus, LiveTopic};
-use gleaner_trust::{Deployment, Grants, Revision, RevisionFile, SecretKey, seal, sha256};
 use hyper::{Method, StatusCode};
 use serde_json::{Value, json};
 use tokio::time::{MissedTickBehavior, interval};
@@ -46,9 +45,11 @@ async fn main() {
         tokio::spawn(drive(vehicle, name, labels, is_hostile));
     }
     admin.call(Method::POST, "/v1/vehicles", json!({ "name": "car-3" })).await;
-    deploy(&admin, "brake-dark", 1, None).await;
-    let fallback = deploy(&admin, "hard-brake", 1, None).await;
-    deploy(&admin, "hard-brake", 2, Some(fallback)).await;
+    let fallback = Signed::new("hard-brake", 1, None);
+    let newest = Signed::new("hard-brake", 2, Some(&fallback));
+    for signed in [Signed::new("brake-dark", 1, None), fallback, newest] {
+        admin.deploy(&signed).await;
+    }
     let invited = json!({ "name": "ann", "role": "admin" });
     let invitation = admin.call(Method::POST, "/v1/users", invited).await;
     let address = format!("http://{}", server.people);
@@ -56,50 +57,6 @@ async fn main() {
     let end = || std::io::copy(&mut std::io::stdin(), &mut std::io::sink());
     tokio::task::spawn_blocking(end).await.unwrap().unwrap();
     server.stop().await;
-}
-
-type Sealed = (String, String);
-
-/// Deploys a lambda with one file; returns its revision.
-async fn deploy(admin: &Person, id: &str, release: u64, fallback: Option<Sealed>) -> Sealed {
-    let (key, file) = (SecretKey::generate().unwrap(), format!("[lambda]\nname = \"{id}\"\n"));
-    let revision = Revision {
-        name: id.parse().unwrap(),
-        version: format!("1.{release}.0").parse().unwrap(),
-        kind: serde_json::from_value(json!("wasm")).unwrap(),
-        release,
-        created: 1_790_000_000,
-        files: vec![RevisionFile {
-            path: "lambda.toml".parse().unwrap(),
-            bytes: file.len() as u64,
-            sha256: sha256(file.as_bytes()),
-        }],
-    };
-    let digest = sha256(&serde_json::to_vec(&revision).unwrap());
-    let deployment = Deployment {
-        id: id.parse().unwrap(),
-        release,
-        selector: [("fleet".parse().unwrap(), "test".to_owned())].into(),
-        revision: digest.clone(),
-        fallback: fallback.as_ref().map(|(digest, _)| digest.parse().unwrap()),
-        config: [].into(),
-        grants: Grants { topics: vec!["/imu".parse().unwrap()], ..Grants::default() },
-        created: 1,
-        expires: 2,
-    };
-    let text = |envelope: Vec<u8>| String::from_utf8(envelope).unwrap();
-    let revision = text(seal(&revision, &[&key]).unwrap());
-    let deployment = text(seal(&deployment, &[&key]).unwrap());
-    let mut revisions = vec![revision.clone()];
-    revisions.extend(fallback.map(|(_, envelope)| envelope));
-    let request = json!({ "deployment": deployment, "revisions": revisions });
-    let reply = admin.call(Method::POST, "/v1/deployments", request.clone()).await;
-    if reply["result"] == "missing" {
-        let object = format!("/v1/objects/{}", sha256(file.as_bytes()));
-        assert!(admin.open(Method::PUT, &object, file.as_bytes()).await.status().is_success());
-        admin.call(Method::POST, "/v1/deployments", request).await;
-    }
-    (digest.to_string(), revision)
 }
 
 /// Follows the cloud as a vehicle would: it reports what it should run as running, and sends

@@ -18,8 +18,8 @@ ALTER TABLE vehicles ADD COLUMN is_ahead BIGINT NOT NULL DEFAULT 0;
 -- Time at which a vehicle reported its status, in ms since 1970.
 ALTER TABLE vehicles ADD COLUMN reported_ms BIGINT NOT NULL DEFAULT 0;
 
--- The boot of the machine that is connected, and of the one before; 1 of a vehicle whose identity
--- two machines have, as the former boot has come back.
+-- The boot of the machine that is connected, and of the one before, and the number of times that a
+-- former boot has come back: from 2 on, two machines have the identity of the vehicle.
 ALTER TABLE vehicles ADD COLUMN boot TEXT NOT NULL DEFAULT '';
 ALTER TABLE vehicles ADD COLUMN former_boot TEXT NOT NULL DEFAULT '';
 ALTER TABLE vehicles ADD COLUMN is_double BIGINT NOT NULL DEFAULT 0;

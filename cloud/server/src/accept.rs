@@ -161,7 +161,6 @@ impl Handshake {
     }
 }
 
-/// The handler of the requests of a connection.
 struct RequestHandler {
     router: Router,
     is_behind_proxy: bool,

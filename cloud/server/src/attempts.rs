@@ -13,7 +13,6 @@ use crate::error::{CloudError, CloudResult};
 /// Maximum number of keys that are remembered. With this many at once, further ones share a limit.
 const KEYS_MAX: usize = 20_000;
 
-/// A limit for each of many keys.
 #[derive(Debug)]
 struct LimitOfEach<K> {
     limit: RateLimit,
@@ -27,8 +26,8 @@ impl<K: Hash + Eq> LimitOfEach<K> {
         Self { limit: RateLimit::of(per_s, burst), burst, limits: Mutex::default() }
     }
 
-    /// Counts an attempt; returns whether it is within the limit.
-    fn take(&self, key: K) -> bool {
+    /// Counts an attempt; above the limit, it is an error with this message and help.
+    fn count(&self, key: K, message: impl FnOnce() -> String, help: &str) -> CloudResult<()> {
         let now = Instant::now();
         let mut limits = self.limits.lock().unwrap_or_else(PoisonError::into_inner);
         if limits.len() >= KEYS_MAX {
@@ -38,7 +37,10 @@ impl<K: Hash + Eq> LimitOfEach<K> {
             });
         }
         let key = (limits.len() < KEYS_MAX).then_some(key);
-        limits.entry(key).or_insert(self.limit).take(1.0, now)
+        match limits.entry(key).or_insert(self.limit).take(1.0, now) {
+            true => Ok(()),
+            false => Err(CloudError::busy(message(), help)),
+        }
     }
 }
 
@@ -62,27 +64,16 @@ impl WrongSecrets {
     /// are right are never refused: others of it, such as all behind a proxy, may use
     /// them.
     pub(crate) fn count(&self, network: ClientNetwork) -> CloudResult<()> {
-        let help = "wait a minute, and use the newest code or token";
-        match self.networks.take(network) {
-            true => Ok(()),
-            false => Err(CloudError::busy(
-                "too many wrong codes and tokens came from your address",
-                help,
-            )),
-        }
+        let message = || "too many wrong codes and tokens came from your address".to_owned();
+        self.networks.count(network, message, "wait a minute, and use the newest code or token")
     }
 
     /// Counts a password before it is checked: unlike codes and tokens, passwords can be guessed,
     /// so that right ones are refused, too.
     pub(crate) fn count_password(&self, network: ClientNetwork, name: &str) -> CloudResult<()> {
-        let name = gleaner_base::excerpt(name);
-        match self.passwords.take((network, name)) {
-            true => Ok(()),
-            false => Err(CloudError::busy(
-                "too many passwords were tried for this name from your address",
-                "wait a minute, or log in by a code that an administrator gives you",
-            )),
-        }
+        let message = || "too many passwords were tried for this name from your address".to_owned();
+        let help = "wait a minute, or log in by a code that an administrator gives you";
+        self.passwords.count((network, gleaner_base::excerpt(name)), message, help)
     }
 }
 
@@ -136,26 +127,15 @@ impl Default for AccountChanges {
 }
 
 impl AccountChanges {
-    /// Counts a change.
     pub(crate) fn count(&self, user: &str) -> CloudResult<()> {
-        match self.0.take(user.to_owned()) {
-            true => Ok(()),
-            false => {
-                let message = format!("user `{user}` has changed too much of the account at once");
-                Err(CloudError::busy(message, "wait a minute, and try again"))
-            }
-        }
+        let message = || format!("user `{user}` has changed too much of the account at once");
+        self.0.count(user.to_owned(), message, "wait a minute, and try again")
     }
 }
 
 fn within(limits: &LimitOfEach<String>, vehicle: &str, what: &str) -> CloudResult<()> {
-    match limits.take(vehicle.to_owned()) {
-        true => Ok(()),
-        false => {
-            let message = format!("vehicle `{vehicle}` has sent too many {what}");
-            Err(CloudError::busy(message, "wait, and pause longer after each attempt"))
-        }
-    }
+    let message = || format!("vehicle `{vehicle}` has sent too many {what}");
+    limits.count(vehicle.to_owned(), message, "wait, and pause longer after each attempt")
 }
 
 #[cfg(test)]

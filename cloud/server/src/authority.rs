@@ -34,13 +34,11 @@ const RENEW_S: u64 = 20 * DAY_S;
 /// Vehicles trust no time more than 366 days after their trust root or program, and a root may be
 /// as much ahead itself: also after a clock that was wrong, it must not have expired for them.
 const SERVER_S: u64 = 3 * 366 * DAY_S;
-/// Lifetime of the authorities.
 const AUTHORITY_S: u64 = 20 * 365 * DAY_S;
 /// Begin of all certificates, in s since 1970: the year 2020. It depends on no clock, as one that
 /// is ahead would make certificates that begin after it is right again.
 const BEGIN_S: u64 = 1_577_836_800;
 
-/// Both authorities.
 pub(crate) struct Authorities {
     server: Authority,
     vehicles: Authority,
@@ -173,7 +171,6 @@ impl Authority {
     }
 }
 
-/// Returns the parameters of a certificate.
 fn params(name: &str, lifetime_s: u64) -> CertificateParams {
     let begin = UNIX_EPOCH + Duration::from_secs(BEGIN_S);
     // A machine without a battery for its clock begins in 1970, and the authorities stay.

@@ -40,7 +40,6 @@ pub(crate) enum Hint {
     Tails,
 }
 
-/// Things to look at.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(crate) struct HintedChanges {
     pub(crate) changed: BTreeSet<String>,
@@ -139,7 +138,6 @@ impl BusAddress {
 }
 
 impl Bus {
-    /// Creates the sending side over a queue.
     #[cfg(test)]
     pub(crate) fn of_queue(queue: mpsc::Sender<Hint>) -> Self {
         Self { queue: Some(queue), dropped: AtomicU64::new(0) }
@@ -173,7 +171,6 @@ impl Bus {
     }
 }
 
-/// Sends hints, one after the other.
 async fn publish(client: Client, subject: String, mut waiting: mpsc::Receiver<Hint>) {
     while let Some(hint) = waiting.recv().await {
         let payload = serde_json::to_vec(&hint).unwrap_or_default();

@@ -17,7 +17,6 @@ use crate::bounds::BoundCounts;
 pub(crate) struct ClientNetwork(IpAddr);
 
 impl ClientNetwork {
-    /// Returns the network of an address.
     pub(crate) fn of(address: IpAddr) -> Self {
         Self(match address.to_canonical() {
             IpAddr::V6(it) if !it.is_loopback() => {

@@ -2,6 +2,9 @@
 
 use std::sync::Arc;
 
+use axum::extract::rejection::ExtensionRejection;
+use axum::extract::{Extension, FromRequestParts};
+use axum::http::request::Parts;
 use tokio::sync::{Mutex, Semaphore};
 use tokio::time::Instant;
 
@@ -42,4 +45,19 @@ pub(crate) struct Cloud {
     pub(crate) keep_records_days: u32,
     /// Address for vehicles, as enrolments state it.
     pub(crate) address: String,
+}
+
+/// A request that a guard has let pass: the state of the server, and the user or the vehicle.
+pub(crate) struct Call<C>(pub(crate) Arc<Cloud>, pub(crate) C);
+
+impl<C: Clone + Send + Sync + 'static> FromRequestParts<Arc<Cloud>> for Call<C> {
+    type Rejection = ExtensionRejection;
+
+    async fn from_request_parts(
+        parts: &mut Parts,
+        cloud: &Arc<Cloud>,
+    ) -> Result<Self, Self::Rejection> {
+        let Extension(caller) = Extension::<C>::from_request_parts(parts, cloud).await?;
+        Ok(Self(Arc::clone(cloud), caller))
+    }
 }

@@ -10,7 +10,6 @@ use gleaner_protocol::vehicle_api::Problem;
 
 use crate::sqlx;
 
-/// The type of the content of an error.
 const PROBLEM: &str = "application/problem+json";
 
 /// Longest text of an error of the framework that is used as a cause.
@@ -65,7 +64,6 @@ impl CloudError {
         Self { status, failure: Failure::new(exit, message).with_help(help) }
     }
 
-    /// Returns its HTTP status.
     pub(crate) fn status(&self) -> StatusCode {
         self.status
     }
@@ -163,7 +161,6 @@ impl IntoResponse for CloudError {
     }
 }
 
-/// Returns whether a path is one of the API.
 pub(crate) fn is_api(path: &str) -> bool {
     path == "/v1" || path.starts_with("/v1/")
 }

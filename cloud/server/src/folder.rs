@@ -115,7 +115,6 @@ impl DataFolder {
         Ok(FolderLock { file, former })
     }
 
-    /// Returns whether the folder has authorities.
     pub(crate) fn has_authorities(&self) -> bool {
         self.authorities().join("server.pem").exists()
     }
@@ -173,17 +172,14 @@ impl DataFolder {
         self.0.join("objects")
     }
 
-    /// Folder of the files of clips.
     pub(crate) fn clips(&self) -> PathBuf {
         self.0.join("clips")
     }
 
-    /// Folder of the files of chunks of records.
     pub(crate) fn records(&self) -> PathBuf {
         self.0.join("records")
     }
 
-    /// Folder of the keys and certificates of the authorities.
     pub(crate) fn authorities(&self) -> PathBuf {
         self.0.join("ca")
     }

@@ -55,7 +55,6 @@ struct HubState {
 }
 
 impl Hub {
-    /// Creates a hub that sends hints to other replicas.
     pub(crate) fn new(bus: Bus) -> Self {
         Self { state: Mutex::default(), bus }
     }
@@ -92,7 +91,6 @@ impl Hub {
         is_newest && !state.is_stopping
     }
 
-    /// Ends the connection of a vehicle.
     pub(crate) fn end(&self, name: &str, reason: &str) {
         if let Some(link) = self.lock().links.remove(name) {
             link.end(TAKEN_MS, reason);
@@ -185,7 +183,6 @@ impl Hub {
         }
     }
 
-    /// Notes a sign of life.
     pub(crate) fn saw(&self, name: &str) {
         let mut state = self.lock();
         match state.seen.get_mut(name) {

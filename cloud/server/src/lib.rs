@@ -42,6 +42,7 @@ mod server;
 mod sqlx;
 mod store;
 mod tails;
+mod ticks;
 mod transfer;
 mod vehicles;
 

@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::io;
 use std::path::Path;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
@@ -12,8 +13,8 @@ use axum::body::Body;
 use axum::http::HeaderMap;
 use axum::response::Response;
 use gleaner_base::{Exit, Failure};
-use gleaner_lambda::manifest::Sha256;
 use gleaner_lambda::manifest::bounds::MANIFEST_MAX;
+use gleaner_lambda::manifest::{MANIFEST_FILE, Sha256};
 use gleaner_protocol::vehicle_api::MissingObject;
 use gleaner_trust::Revision;
 use tokio::sync::RwLock;
@@ -32,11 +33,11 @@ const COLLECTING: Duration = Duration::from_secs(3600);
 const GRACE: Duration = Duration::from_secs(86_400);
 
 /// Removes revisions and files that no release needs, for as long as the program runs.
-pub(crate) async fn collect(cloud: &Cloud) {
+pub(crate) async fn collect(cloud: Arc<Cloud>) {
     let mut looks = interval(COLLECTING);
     loop {
         looks.tick().await;
-        if let Err(error) = collect_once(cloud, GRACE).await {
+        if let Err(error) = collect_once(&cloud, GRACE).await {
             tracing::warn!(reason = error.reason(), "unused files are not removed");
         }
     }
@@ -63,7 +64,6 @@ pub(crate) struct Objects {
 }
 
 impl Objects {
-    /// Creates the access to a place of files.
     pub(crate) fn new(place: FilePlace) -> Self {
         Self { place, parts: AtomicU64::new(0), uses: RwLock::default() }
     }
@@ -121,10 +121,9 @@ impl Objects {
         })?)
     }
 
-    /// Returns the text of the manifest of a revision.
     pub(crate) async fn manifest(&self, revision: &Revision) -> CloudResult<String> {
         let mut files = revision.files.iter();
-        let file = files.find(|file| file.path.as_str() == "lambda.toml");
+        let file = files.find(|file| file.path.as_str() == MANIFEST_FILE);
         let Some(file) = file.filter(|file| file.bytes <= MANIFEST_MAX.bytes()) else {
             let message = format!("a revision of `{}` has no manifest that fits", revision.name);
             return Err(CloudError::usage(message, "build and publish the lambda again"));

@@ -46,7 +46,6 @@ impl FilePlace {
         &self.folder
     }
 
-    /// Returns whether files are kept in a bucket.
     pub(crate) fn is_bucket(&self) -> bool {
         self.bucket.is_some()
     }
@@ -65,7 +64,6 @@ impl FilePlace {
         .await
     }
 
-    /// Returns the length of a file, if it is there.
     pub(crate) async fn length(&self, name: &str) -> io::Result<Option<u64>> {
         match &self.bucket {
             Some((bucket, start)) => bucket.length(&format!("{start}{name}")).await,
@@ -116,7 +114,6 @@ fn found<T>(result: io::Result<T>) -> io::Result<Option<T>> {
     }
 }
 
-/// Does work that blocks.
 pub(crate) async fn blocking<T: Send + 'static>(
     work: impl FnOnce() -> io::Result<T> + Send + 'static,
 ) -> io::Result<T> {

@@ -1,6 +1,5 @@
 //! The command line of the program.
 
-use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -19,7 +18,7 @@ use crate::store::{CONSOLE, CloudStore};
 
 /// The cloud of a fleet: vehicles connect to it, and people deploy by it.
 #[derive(Parser, Debug)]
-#[command(name = "gleaner-cloud", version)]
+#[command(name = "gleaner-cloud", version = gleaner_base::version())]
 struct Args {
     #[command(subcommand)]
     command: CloudCommand,
@@ -112,7 +111,7 @@ async fn serve(options: ServeOptions) -> Result<(), Failure> {
 }
 
 async fn invite(new: NewUser, data: &Path, store: Option<&str>) -> Result<(), Failure> {
-    let store = CloudStore::open(&DataFolder::existing(data)?.store(store)?).await?;
+    let store = CloudStore::in_use(&DataFolder::existing(data)?.store(store)?).await?;
     let invitation = store.invite(CONSOLE, new).await?;
     store.close().await;
     print(&format!("{}\n", invitation.code));
@@ -132,19 +131,21 @@ async fn backup(file: &Path, data: &Path) -> Result<(), Failure> {
     }
     // A name that began with `file:` would be a URL to SQLite.
     let whole = std::path::absolute(file).map_err(failed)?;
-    let part = whole.with_added_extension("part");
-    let name = part.to_str().ok_or_else(|| refused("is not UTF-8", "choose another name"))?;
-    let store = CloudStore::open(&DataFolder::existing(data)?.store(None)?).await?;
-    // One that was killed has left it.
-    match fs::remove_file(&part) {
-        Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(failed(error)),
-        _ => {}
-    }
+    let folder = whole.parent().unwrap_or(&whole);
+    let store = CloudStore::in_use(&DataFolder::existing(data)?.store(None)?).await?;
+    // Another backup to the same file has another one.
+    let part = tempfile::Builder::new().prefix(".backup-").suffix(".part").tempfile_in(folder);
+    let part = part.map_err(failed)?;
+    let name = part.path().to_str();
+    let name = name.ok_or_else(|| refused("is not UTF-8", "choose another name"))?;
     store.copy_to(name).await?;
     store.close().await;
-    let made = File::open(&part).and_then(|copy| copy.sync_all());
-    made.and_then(|()| fs::rename(&part, &whole)).map_err(failed)?;
-    whole.parent().map_or(Ok(()), sync_folder).map_err(failed)
+    let made = part.as_file().sync_all().map_err(failed);
+    let copy = made.and_then(|()| part.persist_noclobber(&whole).map_err(|it| failed(it.error)))?;
+    sync_folder(folder).map_err(failed)?;
+    let bytes = copy.metadata().map_err(failed)?.len();
+    print(&format!("`{}` has {bytes} bytes\n", whole.display()));
+    Ok(())
 }
 
 fn print(text: &str) {

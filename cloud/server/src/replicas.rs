@@ -11,13 +11,14 @@ use std::time::Duration;
 use futures_util::future::try_join_all;
 use gleaner_base::{Exit, Failure};
 use tokio::sync::watch;
-use tokio::time::{MissedTickBehavior, interval, sleep};
+use tokio::time::sleep;
 
 use crate::bus::ReceivedHints;
 use crate::cloud::Cloud;
 use crate::error::CloudResult;
 use crate::store::OwnLink;
 use crate::tails;
+use crate::ticks::ticks;
 
 /// Interval of looks. With a look that takes its time, a revoked vehicle is cut off within 5 s.
 const LOOK: Duration = Duration::from_secs(2);
@@ -34,8 +35,7 @@ pub(crate) async fn keep_lease(
     is_alone: bool,
     failed: watch::Sender<Option<Failure>>,
 ) {
-    let mut ticks = interval(RENEW);
-    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut ticks = ticks(RENEW);
     loop {
         ticks.tick().await;
         match cloud.store.renew_lease(is_alone).await {
@@ -57,8 +57,7 @@ pub(crate) async fn keep_lease(
 
 /// Follows the changes of other replicas, for as long as this process runs.
 pub(crate) async fn follow(cloud: &Cloud, hints: Option<Arc<ReceivedHints>>) {
-    let mut ticks = interval(LOOK);
-    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut ticks = ticks(LOOK);
     let mut follower = ReplicaFollower::default();
     let mut has_failed = false;
     loop {

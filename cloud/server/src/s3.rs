@@ -42,7 +42,6 @@ const TEXT_MAX: usize = 4 << 20;
 
 type Failed = Box<dyn Error + Send + Sync>;
 
-/// A request about a name.
 enum S3Call<'c> {
     Put { path: &'c Path, length: u64 },
     Head,
@@ -131,7 +130,6 @@ impl S3Bucket {
         accepted(answer).await.map(drop)
     }
 
-    /// Returns the length of an object.
     pub(crate) async fn length(&self, name: &str) -> io::Result<Option<u64>> {
         let answer = self.answer(name, &S3Call::Head).await?;
         if answer.status() == StatusCode::NOT_FOUND {

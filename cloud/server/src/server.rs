@@ -10,7 +10,6 @@ use rustls::ServerConfig;
 use tokio::net::TcpListener;
 use tokio::sync::{Semaphore, watch};
 use tokio::task::JoinSet;
-use tokio::time::{Interval, MissedTickBehavior, interval};
 
 use crate::accept::Entrance;
 use crate::attempts::{AccountChanges, VehicleLimits, WrongSecrets};
@@ -26,6 +25,7 @@ use crate::readers::Readers;
 use crate::records::ChunkFiles;
 use crate::s3::S3Bucket;
 use crate::store::{ClipBounds, CloudStore, Retention, now};
+use crate::ticks::ticks;
 use crate::{clips, objects, people, records, replicas, tails, vehicles};
 
 /// Maximum number of open connections of people, and of vehicles: a whole fleet has another one
@@ -294,33 +294,20 @@ fn vehicles_entrance(
 
 /// Spawns the chores that a cloud has with and without replicas.
 fn spawn_chores(chores: &mut JoinSet<()>, cloud: &Arc<Cloud>) {
-    let working = Arc::clone(cloud);
-    chores.spawn(async move { clips::clean(&working).await });
-    let working = Arc::clone(cloud);
-    chores.spawn(async move { objects::collect(&working).await });
-    let working = Arc::clone(cloud);
-    chores.spawn(async move { records::keep(&working).await });
-    let working = Arc::clone(cloud);
-    chores.spawn(async move { tails::keep(&working).await });
-    let working = Arc::clone(cloud);
-    chores.spawn(async move { keep_seen(&working).await });
-    let working = Arc::clone(cloud);
-    chores.spawn(async move { advance_waves(&working).await });
-}
-
-/// Returns ticks, now and then after each interval. One that comes late moves those after it.
-fn ticks(period: Duration) -> Interval {
-    let mut ticks = interval(period);
-    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
-    ticks
+    chores.spawn(clips::clean(Arc::clone(cloud)));
+    chores.spawn(objects::collect(Arc::clone(cloud)));
+    chores.spawn(records::keep(Arc::clone(cloud)));
+    chores.spawn(tails::keep(Arc::clone(cloud)));
+    chores.spawn(keep_seen(Arc::clone(cloud)));
+    chores.spawn(advance_waves(Arc::clone(cloud)));
 }
 
 /// Stores the last signs of life, for as long as this process runs.
-async fn keep_seen(cloud: &Cloud) {
+async fn keep_seen(cloud: Arc<Cloud>) {
     let mut ticks = ticks(SEEN_INTERVAL);
     loop {
         ticks.tick().await;
-        store_seen(cloud).await;
+        store_seen(&cloud).await;
     }
 }
 
@@ -331,7 +318,7 @@ async fn store_seen(cloud: &Cloud) {
 }
 
 /// Advances the waves of releases, for as long as this process runs.
-async fn advance_waves(cloud: &Cloud) {
+async fn advance_waves(cloud: Arc<Cloud>) {
     let mut ticks = ticks(WAVES_INTERVAL);
     loop {
         ticks.tick().await;

@@ -12,10 +12,11 @@ use std::time::{Duration, Instant};
 use gleaner_fleet::STATUS_STREAM;
 use gleaner_lambda::manifest::ItemName;
 use tokio::sync::Notify;
-use tokio::time::{MissedTickBehavior, interval, sleep};
+use tokio::time::sleep;
 
 use crate::cloud::Cloud;
 use crate::error::CloudResult;
+use crate::ticks::ticks;
 
 /// Interval at which leases are renewed: a third of their time.
 const RENEW: Duration = Duration::from_secs(20);
@@ -118,9 +119,8 @@ impl Drop for TailReader {
 }
 
 /// Keeps the leases of readers of this process, for as long as it runs.
-pub(crate) async fn keep(cloud: &Cloud) {
-    let mut ticks = interval(RENEW);
-    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+pub(crate) async fn keep(cloud: Arc<Cloud>) {
+    let mut ticks = ticks(RENEW);
     // Those of an earlier process may be left.
     let mut has_leases = true;
     loop {
@@ -137,7 +137,7 @@ pub(crate) async fn keep(cloud: &Cloud) {
             if is_new {
                 cloud.hub.tails_changed();
             }
-            deliver(cloud).await
+            deliver(&cloud).await
         };
         if let Err(error) = renewed.await {
             tracing::warn!(reason = error.reason(), "records that people follow come later");
@@ -184,7 +184,7 @@ mod tests {
         };
         tokio::select! {
             () = stored => {}
-            () = keep(&cloud) => {}
+            () = keep(Arc::clone(&cloud)) => {}
             () = readers => {}
         }
         assert!(begun.elapsed() >= 3 * PAUSE, "{:?}", begun.elapsed());

@@ -176,7 +176,6 @@ impl StoredBytes {
         Self { name: name.to_owned(), length, sha256: None }
     }
 
-    /// Returns the same bytes, with this SHA-256.
     pub(crate) fn with_sha256(self, sha256: &str) -> Self {
         Self { sha256: Some(sha256.to_owned()), ..self }
     }

@@ -14,7 +14,7 @@ use gleaner_host::guest::wasm::{Loaded, WasmGuest};
 use gleaner_host::input::open_inputs;
 use gleaner_journal::{Decoder, Encoder, JournalEntry, WakeSource};
 use gleaner_lambda::Manifest;
-use gleaner_messages::{Endian, Sources};
+use gleaner_messages::Endian;
 use gleaner_operations::Operation::{
     AsFrame, Column, Field, Input as Topics, MeanLuma, Newest, Resize, ToGray,
 };
@@ -24,6 +24,7 @@ use gleaner_transport::{Guid, SampleMeta};
 use super::pictures::{coded, raw};
 use super::{picture, program};
 use crate::input::FuzzInput;
+use crate::message::bundled_text;
 
 /// Host memory budget of an input: 4 MiB for decoded frames by the manifest, and as much for
 /// everything else. Samples and the guest's memory are mapped, so they do not count.
@@ -63,7 +64,6 @@ pub(super) struct DriverWake {
     log: Vec<LogLine>,
 }
 
-/// State that all instances share.
 struct Common {
     manifest: Manifest,
     loaded: Loaded,
@@ -95,13 +95,7 @@ fn common() -> &'static Common {
         let stack = manifest.limits.stack.as_usize();
         let loaded = Loaded::open(&code, &cache, stack, Nans::Native)
             .unwrap_or_else(|error| missing(&error));
-        let definition = |name| {
-            let text = Sources::default()
-                .find(name)
-                .expect("bundled types are complete")
-                .expect("the type is bundled");
-            (name, text.to_string())
-        };
+        let definition = |name| (name, bundled_text(name).to_string());
         let definitions =
             ["sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"].map(definition);
         Common { manifest, loaded, definitions, raw: raw(), coded: coded() }

@@ -1,8 +1,8 @@
 //! Seeds: messages full of ones, which are valid lengths too, of every type.
 
-use gleaner_messages::{CdrWriter, Sources};
+use gleaner_messages::CdrWriter;
 
-use crate::message::{TYPES, mode};
+use crate::message::{TYPES, bundled_text, mode};
 
 /// Dictionary of definitions and paths.
 pub const WORDS: &[&str] = &[
@@ -70,11 +70,7 @@ pub fn all() -> Vec<Vec<u8>> {
     for name in
         ["sensor_msgs/msg/Imu", "diagnostic_msgs/msg/DiagnosticArray", "tf2_msgs/msg/TFMessage"]
     {
-        let text = Sources::default()
-            .find(name)
-            .expect("bundled types are complete")
-            .expect("the type is bundled");
-        seeds.push(defined(&text, &ones(0)));
+        seeds.push(defined(&bundled_text(name), &ones(0)));
     }
     seeds.extend([image(), compressed()]);
     seeds

@@ -47,7 +47,6 @@ impl DerivedKind {
         }
     }
 
-    /// Returns the extension of its files.
     const fn extension(self) -> &'static str {
         match self {
             DerivedKind::NativeCode => "cwasm",
@@ -106,7 +105,6 @@ impl Explain for StoreError {
     }
 }
 
-/// Returns whether a path is that of an entry.
 fn is_entry(path: &Path) -> bool {
     let extension = path.extension().and_then(|extension| extension.to_str());
     DerivedKind::ALL.iter().any(|kind| Some(kind.extension()) == extension)

@@ -16,7 +16,6 @@ const BYTE: &str = "GLEANER_TEST_BYTE";
 
 const CONTENT_BYTES: usize = 1 << 20;
 
-/// Time after which an awaited event is missing.
 const TIMEOUT: Duration = Duration::from_secs(60);
 
 fn entry(store: &Path) -> DerivedEntry {

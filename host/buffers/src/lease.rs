@@ -195,7 +195,6 @@ impl<M> fmt::Debug for Lease<M> {
     }
 }
 
-/// One hold on a slot of a pool.
 struct SlotHold<M> {
     slots: Arc<Slots<M>>,
     index: u32,

@@ -12,7 +12,7 @@ use rustix::process::{Resource, Rlimit, setrlimit};
 
 /// Compiles a WebAssembly component to native code for this machine.
 #[derive(Parser)]
-#[command(version)]
+#[command(version = gleaner_base::version())]
 struct Args {
     /// Measure the speed of this machine instead, and print fuel units per second
     #[arg(long, exclusive = true, hide = true)]
@@ -37,6 +37,7 @@ struct Args {
 }
 
 fn main() -> ExitCode {
+    gleaner_base::set_commit(option_env!("GLEANER_COMMIT"));
     let args = Args::parse();
     let done = match (&args.component, &args.cache) {
         (Some(component), Some(cache)) => {

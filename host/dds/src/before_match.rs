@@ -43,7 +43,6 @@ impl BeforeMatch {
         Self { subscribed_ns, writers: HashMap::new(), of_gone: 0 }
     }
 
-    /// Takes a received sample.
     pub(super) fn note(&mut self, meta: &SampleMeta) {
         let Some(first) = self.writers.get_mut(&meta.writer) else {
             if self.writers.len() < MOST {

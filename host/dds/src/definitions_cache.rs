@@ -33,7 +33,6 @@ const PAUSE: Duration = Duration::from_secs(10);
 /// Most types that are remembered to have no definitions: more than there are topics.
 const MOST: usize = 8192;
 
-/// Help where a definition is missing.
 const HELP: &str = "put the publisher's `.msg` files into the `msg` folder of the lambda";
 
 /// A type, and the hash of its layout if its writers announce one.

@@ -52,7 +52,6 @@ const WALK: u32 = 2;
 const NUMBER: u32 = 3;
 const ALL: u32 = u32::MAX;
 
-/// The byte order of a submessage.
 #[derive(Copy, Clone, PartialEq, Eq)]
 enum ByteOrder {
     Low,

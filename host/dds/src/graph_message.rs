@@ -50,7 +50,6 @@ pub(super) enum Listing {
 /// Detects the distribution of the other nodes, from which the format of our messages follows.
 #[derive(Clone, Debug)]
 pub(super) struct DistroDetector {
-    /// The configured distribution.
     configured: Option<Distro>,
     humble: bool,
     newer: bool,
@@ -91,7 +90,6 @@ impl DistroDetector {
 }
 
 impl Listing {
-    /// Describes the state of node `node`.
     pub(super) fn describe(self, node: &str) -> String {
         match self {
             Self::Unlisted => "not listed: no ROS 2 node seen yet".to_owned(),

@@ -13,7 +13,6 @@ use super::state::ParticipantState;
 /// A limit of socket option memory that is enough for a filter.
 const OPTIONS: &str = "sysctl -w net.core.optmem_max=131072";
 
-/// The filter of a participant's sockets.
 pub(super) struct PacketFilter {
     sockets: Vec<OwnedFd>,
     own: Prefix,

@@ -11,7 +11,6 @@ use gleaner_transport::Guid;
 /// Most participants, and most matches of one local endpoint, that are tracked.
 const MOST: usize = 4096;
 
-/// The GUID prefix of `guid`'s participant.
 pub(super) fn prefix(guid: &GUID) -> Prefix {
     *guid.to_bytes().first_chunk().expect("12 of 16 bytes")
 }

@@ -36,7 +36,6 @@ pub(super) struct Offer {
 }
 
 impl Offer {
-    /// The encoding of its samples.
     pub(super) fn encoding(&self) -> &'static str {
         match DataRepresentation::offered_representation(self.qos.data_representation().as_ref()) {
             policy::XCDR_DATA_REPRESENTATION => "XCDR1",
@@ -113,7 +112,6 @@ fn transient_local(qos: &QosPolicies) -> bool {
     qos.durability().is_some_and(|durability| durability >= Durability::TransientLocal)
 }
 
-/// Describes the offer of a writer.
 pub(super) fn describe(qos: &QosPolicies) -> String {
     let mut words =
         Request { reliable: reliable(qos), transient_local: transient_local(qos) }.to_string();

@@ -87,7 +87,6 @@ const ENCODINGS: [RepresentationIdentifier; 17] = [
     RepresentationIdentifier::D_CDR_BE,
 ];
 
-/// The reason why a sample cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum Unreadable {
     #[error("no memory for {bytes} bytes")]

@@ -48,7 +48,6 @@ pub const MOST_MAPPED: usize = 256 << 20;
 /// them.
 const MAPPED_BLOCK: usize = 1 << 20;
 
-/// A command to the receive thread.
 pub(super) enum ReceiverCommand {
     Subscribe(Box<TopicReader>),
     /// Ends the subscription with this number.
@@ -59,7 +58,6 @@ pub(super) enum ReceiverCommand {
     Stop,
 }
 
-/// A handle to send commands to the receive thread.
 #[derive(Clone)]
 pub(super) struct ReceiverHandle {
     commands: mpsc::Sender<ReceiverCommand>,
@@ -102,7 +100,6 @@ struct Receiver {
     updated: Option<Instant>,
 }
 
-/// Starts the thread.
 pub(super) fn start(
     options: &DdsOptions,
     node: (String, String),

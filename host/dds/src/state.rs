@@ -16,7 +16,6 @@ use gleaner_transport::{Guid, ReceptionStatus};
 /// A count that is unknown.
 pub(super) const UNKNOWN: u64 = u64::MAX;
 
-/// State of the participant.
 #[derive(Debug, Default)]
 pub(super) struct ParticipantState {
     dead: Mutex<Option<String>>,
@@ -33,7 +32,6 @@ pub(super) struct ParticipantState {
     to: AtomicUsize,
 }
 
-/// Status of one subscription.
 #[derive(Debug, Default)]
 pub(super) struct SubscriptionStatus {
     /// Set when the subscription has ended: its sink gets no further samples.
@@ -148,7 +146,6 @@ impl OnceLog {
     }
 }
 
-/// The text of a panic.
 pub(super) fn panic_text(panic: &(dyn std::any::Any + Send)) -> String {
     let text = panic
         .downcast_ref::<&str>()

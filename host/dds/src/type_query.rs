@@ -63,7 +63,6 @@ pub(super) struct Attempts {
     pub(super) unanswered: usize,
 }
 
-/// The outcome of a query.
 #[derive(Debug)]
 pub(super) enum QueryOutcome {
     /// A node answered.
@@ -88,7 +87,6 @@ pub(super) enum Retry {
     Unsent,
 }
 
-/// Runs the open query.
 #[derive(Default)]
 pub(super) struct TypeQuerier {
     open: Option<OpenQuery>,

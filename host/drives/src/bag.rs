@@ -14,7 +14,6 @@ use super::storage::Bag;
 const ENDINGS: [&str; 4] = [".mcap", ".db3", ".mcap.zstd", ".db3.zstd"];
 const PACKED: &str = ".zstd";
 
-/// Returns the files of the directory `folder`.
 pub(super) fn list(folder: &Path) -> Result<Bag, ReplayError> {
     let path = folder.join("metadata.yaml");
     let root = folder

@@ -24,7 +24,6 @@ const OTHER_HASH: &str = "a channel states a type hash that is not that of its d
     writer had another version of the type; record it where the messages of the writer are \
     installed";
 
-/// A channel of a drive.
 #[derive(Copy, Clone)]
 pub(super) struct DriveChannel {
     /// Index of its file.
@@ -200,7 +199,6 @@ pub(super) struct Selected<'a> {
     pub(super) messages: Option<u64>,
 }
 
-/// All topics.
 pub(super) struct Catalog {
     /// One entry for each type of a topic, that with the most messages first.
     by_name: BTreeMap<String, Vec<DriveTopic>>,

@@ -160,7 +160,6 @@ impl OpenSegment {
     }
 }
 
-/// Parses the header of a message record.
 pub(super) fn message_head(body: &[u8]) -> Result<MessageHead, Damage> {
     MessageHead::parse(body).ok_or(Damage::Malformed("a message record is shorter than its header"))
 }

@@ -224,7 +224,6 @@ fn is_known_version(db: &Connection) -> Result<(), BoxedError> {
     }
 }
 
-/// The topics of a database.
 struct DatabaseTopics {
     channels: Channels,
     /// Channel ids by topic number of the database.
@@ -280,7 +279,6 @@ fn topics(db: &Connection) -> Result<DatabaseTopics, BoxedError> {
     Ok(known)
 }
 
-/// A message definition of a database.
 struct DatabaseDefinition {
     encoding: String,
     text: Arc<str>,

@@ -63,7 +63,6 @@ use tracing::warn;
 pub struct Replay {
     tracks: Vec<Track>,
     catalog: Arc<Catalog>,
-    /// The subscriptions, with their sinks.
     subscribed: Vec<(TopicSpec, Arc<dyn Sink>)>,
     /// Paths and options of the drive, if latched samples from before the part to replay are
     /// delivered.
@@ -284,7 +283,6 @@ impl Replay {
         ends.max().map(nanoseconds)
     }
 
-    /// Returns the topics of the drive.
     pub(super) fn catalog(&self) -> Arc<Catalog> {
         Arc::clone(&self.catalog)
     }

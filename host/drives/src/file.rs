@@ -11,7 +11,6 @@ use super::damage::Damage;
 use super::records::{McapChannel, McapSchema, op};
 use gleaner_transport::Guid;
 
-/// A channel of a file.
 pub(super) struct ChannelInfo {
     pub(super) topic: String,
     /// Empty if the channel has no schema.

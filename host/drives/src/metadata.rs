@@ -13,7 +13,6 @@ pub(super) const MAX_BYTES: u64 = 16 << 20;
 /// Length limit for names of storages and compressions in errors; those of rosbag2 are shorter.
 const SHOWN_CHARS: usize = 32;
 
-/// The needed content of the metadata.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) struct BagMetadata {
     /// The file names, at least one.
@@ -58,7 +57,6 @@ struct TopicMetadata {
     name: String,
 }
 
-/// Reasons why metadata cannot be used.
 #[derive(Debug, thiserror::Error)]
 enum MetadataError {
     #[error("its storage is `{0}`; only mcap and sqlite3 can be read")]

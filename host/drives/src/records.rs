@@ -39,7 +39,6 @@ pub(super) fn head(bytes: &[u8]) -> Option<(u8, u64)> {
     Some((*opcode, u64::from_le_bytes(*rest.first_chunk()?)))
 }
 
-/// Iterates over the records in `bytes`.
 pub(super) struct Records<'a> {
     bytes: &'a [u8],
     at: usize,
@@ -77,7 +76,6 @@ impl<'a> Iterator for Records<'a> {
     }
 }
 
-/// The header of a message record.
 #[derive(Copy, Clone)]
 pub(super) struct MessageHead {
     pub(super) channel: u16,
@@ -109,7 +107,6 @@ impl MessageHead {
     }
 }
 
-/// The header of a chunk record.
 pub(super) struct ChunkHead<'a> {
     pub(super) uncompressed: u64,
     pub(super) crc: u32,
@@ -132,7 +129,6 @@ impl<'a> ChunkHead<'a> {
     }
 }
 
-/// A schema record.
 pub(super) struct McapSchema<'a> {
     pub(super) id: u16,
     pub(super) name: &'a str,
@@ -152,7 +148,6 @@ impl<'a> McapSchema<'a> {
     }
 }
 
-/// A channel record.
 pub(super) struct McapChannel<'a> {
     pub(super) id: u16,
     pub(super) schema: u16,
@@ -190,7 +185,6 @@ impl<'a> Map<'a> {
     }
 }
 
-/// A metadata record.
 pub(super) struct McapMetadata<'a> {
     pub(super) name: &'a str,
     pub(super) map: Map<'a>,
@@ -203,7 +197,6 @@ impl<'a> McapMetadata<'a> {
     }
 }
 
-/// An attachment record.
 pub(super) struct McapAttachment<'a> {
     pub(super) name: &'a str,
     pub(super) media_type: &'a str,
@@ -301,7 +294,6 @@ impl<'a> Fields<'a> {
         self.array().map(u64::from_le_bytes)
     }
 
-    /// Takes the next `len` bytes.
     fn take(&mut self, len: usize) -> Option<&'a [u8]> {
         let (found, rest) = self.0.split_at_checked(len)?;
         self.0 = rest;

@@ -59,7 +59,6 @@ pub(super) struct MessageRows {
     pieces: u64,
 }
 
-/// The reason why a piece ended.
 enum PieceEnd {
     /// There are more messages, from this time on.
     Piece(u64),
@@ -213,7 +212,6 @@ fn unreadable(error: rusqlite::Error) -> Damage {
     Damage::Database(error.into())
 }
 
-/// A piece while it is filled.
 struct PieceFiller<'a> {
     channels: &'a HashMap<i64, u16>,
     wanted: &'a [i64],

@@ -115,7 +115,6 @@ struct FileScan<'a> {
     data_crc: Option<(u64, u32)>,
 }
 
-/// The next step after a record.
 enum ScanStep {
     GoOn(u64),
     End,

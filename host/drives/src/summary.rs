@@ -28,7 +28,6 @@ pub(super) struct Tail {
     pub(super) finished: bool,
     /// A summary that names every channel and every chunk, if the writer added one.
     pub(super) summary: Option<Summary>,
-    /// Damage of the summary, if there is one.
     pub(super) damage: Option<(u64, Damage)>,
 }
 

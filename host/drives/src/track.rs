@@ -76,7 +76,6 @@ struct Route {
     seen: u64,
 }
 
-/// One subscription of a channel.
 #[derive(Copy, Clone)]
 struct ChannelSubscription {
     by: Subscription,
@@ -129,7 +128,6 @@ impl Track {
         self.contents.damage.is_some()
     }
 
-    /// Returns the number of the recording that it belongs to.
     pub(super) fn recording(&self) -> usize {
         self.recording
     }

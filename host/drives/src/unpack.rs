@@ -66,7 +66,6 @@ impl AsRef<Path> for ContentName {
     }
 }
 
-/// Limits of the content of a file.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 enum SizeLimit {
     /// The limit of all packed files together.

@@ -32,7 +32,6 @@ struct Numbers {
     is_split: AtomicBool,
 }
 
-/// The writer of one channel.
 pub(super) struct ChannelWriter {
     guid: Guid,
     /// True if the channel's metadata names it, and it was a real one.

@@ -237,7 +237,6 @@ impl Feed {
         &self.status
     }
 
-    /// Returns the topics that are attached, with their ids.
     pub(crate) fn attached(&self) -> &[(u32, TopicMemory)] {
         &self.attached
     }
@@ -253,7 +252,6 @@ impl Feed {
         Box::new(FeedPublisher { requests: self.requests.clone(), index })
     }
 
-    /// Waits for an event.
     fn wait_for(
         &mut self,
         is_awaited: impl Fn(&FeedEvent) -> bool,
@@ -284,7 +282,6 @@ impl Feed {
         Err(error)
     }
 
-    /// Receives what has arrived.
     fn read(&mut self) {
         // If it fails because the ingress has ended, its last messages may still be there.
         let _ = self.requests.flush();

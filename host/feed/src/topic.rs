@@ -56,7 +56,6 @@ pub(crate) struct OwnPage {
     taken: Box<[bool]>,
 }
 
-/// A topic that could not be attached.
 pub(crate) enum AttachError {
     /// The ingress broke a rule.
     Malformed(FeedError),
@@ -71,7 +70,6 @@ impl OwnPage {
         Ok(OwnPage { control, taken: vec![false; HAZARDS].into() })
     }
 
-    /// Maps the memory of a topic.
     pub(crate) fn attach(
         &mut self,
         info: AttachedTopic,

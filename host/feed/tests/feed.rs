@@ -60,7 +60,6 @@ impl FakeIngress {
         self.link.send(message, file).unwrap();
     }
 
-    /// Attaches a topic.
     fn attach(&mut self, id: u32, first_word: u32) -> SharedWriter {
         let (region, file) = region();
         let mut writer = SharedWriter::new(WriterMemory::new(region, LAYOUT).unwrap());
@@ -71,7 +70,6 @@ impl FakeIngress {
         writer
     }
 
-    /// Waits for a request.
     fn request(&mut self) -> ReaderRequest {
         loop {
             match self.link.poll().unwrap() {
@@ -83,7 +81,6 @@ impl FakeIngress {
     }
 }
 
-/// Returns memory for a topic, and its file.
 fn region() -> (TopicRegion, OwnedFd) {
     let bytes = LAYOUT.bytes_needed().unwrap();
     let (region, file) = TopicRegion::create("test", bytes, bytes).unwrap();
@@ -95,7 +92,6 @@ fn publish(writer: &mut SharedWriter, value: u8) {
     writer.publish(&[value.into(); META_WORDS]).unwrap();
 }
 
-/// Returns the newest sample.
 fn newest(topic: &FedTopic) -> Option<Vec<u8>> {
     topic.reader.newest_before(u64::MAX).unwrap().map(|sample| sample.to_vec())
 }

@@ -17,11 +17,9 @@ use crate::sessions::{SessionId, SessionKey};
 /// Messages of a lambda that are read in one second; a lambda makes a few for each wake.
 const MESSAGES_PER_SECOND: u32 = 2000;
 
-/// Identifies a connected lambda.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub(crate) struct LambdaId(pub(crate) u64);
 
-/// A call that is not answered yet.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct OpenCall {
     pub(crate) id: u64,
@@ -35,10 +33,8 @@ pub(crate) struct OpenCall {
     pub(crate) stage: CallStage,
 }
 
-/// The progress of a call.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum CallStage {
-    /// The model is being loaded.
     Loading,
     /// The run waits for others.
     Waiting,
@@ -54,7 +50,6 @@ pub(crate) struct GrantedSession {
     pub(crate) refused: Option<String>,
 }
 
-/// A connected lambda.
 #[derive(Debug)]
 pub(crate) struct ConnectedLambda {
     pub(crate) name: String,

@@ -27,7 +27,6 @@ use crate::sessions::{LoadState, SessionId, SessionKey, SessionTable};
 use crate::threads::{ModelThreads, ThreadResult};
 use crate::worker::{LastRun, RunDone, RunJob, RunOutputs, WorkerModel, WorkerRequest};
 
-/// Interval of the status.
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);
 /// Interval of checks for models that take too long.
 const WORK_INTERVAL: Duration = Duration::from_millis(100);
@@ -37,7 +36,6 @@ const END_TIMEOUT: Duration = Duration::from_secs(1);
 /// Receives reports. It must not block.
 pub type ReportSink = Box<dyn FnMut(InferenceReport) + Send>;
 
-/// The process that runs models.
 pub(crate) struct InferenceEngine {
     threads: ModelThreads,
     reports: ReportSink,
@@ -60,14 +58,12 @@ struct PassedModel {
     engine: PassedEngine,
 }
 
-/// The run in progress.
 struct RunInProgress {
     job: u64,
     lambda: LambdaId,
     stop: Arc<StopSignal>,
 }
 
-/// The reason why the loop ends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum EngineEnd {
     Stopped,
@@ -151,7 +147,6 @@ impl InferenceEngine {
         }
     }
 
-    /// Waits until something has to be done.
     fn wait(
         &self,
         control: &InferenceServer,
@@ -167,7 +162,6 @@ impl InferenceEngine {
         self.lambdas.wait(control, self.threads.wake(), stop, timeout).map_err(EngineError::Wait)
     }
 
-    /// Handles all requests of the starter that have arrived.
     fn handle_control(&mut self, control: &mut InferenceServer) -> Option<EngineEnd> {
         loop {
             match control.poll() {
@@ -196,7 +190,6 @@ impl InferenceEngine {
         }
     }
 
-    /// Handles a request of a lambda.
     fn handle_request(&mut self, id: LambdaId, request: ModelRequest) {
         self.expire(id, monotonic_ns());
         let Some(lambda) = self.lambdas.get_mut(id) else { return };

@@ -4,7 +4,6 @@ use std::io;
 
 use crate::running::ModelWork;
 
-/// The reason why the process cannot go on.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum EngineError {
     /// A model takes too long and cannot be interrupted.

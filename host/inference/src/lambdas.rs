@@ -20,14 +20,12 @@ const LAMBDAS: usize = 512;
 pub(crate) const TOO_MANY: &str = "gleaner-inference serves 512 lambdas, and this one came later: stop others, or start it in a \
      `gleaner run` of its own";
 
-/// All connected lambdas.
 #[derive(Debug, Default)]
 pub(crate) struct LambdaTable {
     lambdas: BTreeMap<LambdaId, ConnectedLambda>,
     last_id: u64,
 }
 
-/// Descriptors with something to do.
 #[derive(Debug)]
 pub(crate) struct ReadyDescriptors {
     pub(crate) control: bool,
@@ -37,7 +35,6 @@ pub(crate) struct ReadyDescriptors {
 }
 
 impl LambdaTable {
-    /// Adds a lambda.
     pub(crate) fn add(&mut self, add: AddClient, socket: OwnedFd) {
         if self.lambdas.len() >= LAMBDAS {
             error!(lambda = add.name, "more than {LAMBDAS} lambdas: one is not served");
@@ -62,7 +59,6 @@ impl LambdaTable {
         gone.filter_map(|(id, lambda)| Some((id, lambda.call?))).collect()
     }
 
-    /// Returns the number of lambdas.
     pub(crate) fn len(&self) -> u64 {
         self.lambdas.len() as u64
     }
@@ -73,7 +69,6 @@ impl LambdaTable {
         waiting.count() as u64
     }
 
-    /// Returns the earliest deadline of a call.
     pub(crate) fn next_deadline(&self) -> Option<u64> {
         self.calls().filter_map(|call| call.deadline_ns).min()
     }
@@ -83,7 +78,6 @@ impl LambdaTable {
         self.with_call(|call| call.deadline_ns.is_some_and(|deadline| deadline <= now_ns))
     }
 
-    /// Returns the lambdas whose call is about a session.
     pub(crate) fn with_call_on(&self, session: SessionId) -> Vec<LambdaId> {
         self.with_call(|call| call.session == session)
     }

@@ -23,7 +23,6 @@ use crate::sessions::{ReadyModel, SessionId, SessionKey};
 /// The entry with the engine of a model, unverified; or the reason why it must not be used.
 pub(crate) type PassedEngine = Result<Option<Arc<File>>, String>;
 
-/// A model to load.
 pub(crate) struct LoadJob {
     pub(crate) session: SessionId,
     pub(crate) key: SessionKey,
@@ -33,14 +32,12 @@ pub(crate) struct LoadJob {
     pub(crate) lambdas: Vec<String>,
 }
 
-/// The result of a job.
 pub(crate) struct LoadDone {
     pub(crate) session: SessionId,
     /// The model, or the reason why it cannot be used.
     pub(crate) loaded: Result<(Box<dyn LoadedGraph>, ReadyModel), String>,
 }
 
-/// Limits of loading.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct LoadLimits {
     /// Largest size of a file, in bytes.
@@ -60,7 +57,6 @@ pub(crate) struct ModelLoader {
     pub(crate) note: WorkNote,
 }
 
-/// The reason why a model cannot be used.
 #[derive(Debug, thiserror::Error)]
 enum ModelError {
     #[error("it cannot be read")]
@@ -80,7 +76,6 @@ enum ModelError {
 }
 
 impl ModelLoader {
-    /// Loads a model.
     pub(crate) fn load(&self, job: &LoadJob) -> LoadDone {
         let (limit, stop) = (self.limits.load_max, Arc::new(StopSignal::default()));
         self.note.begin(ModelWork {

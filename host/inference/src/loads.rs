@@ -51,7 +51,6 @@ impl LoadQueue {
         Some(job)
     }
 
-    /// Ends the load in progress.
     pub(crate) fn end(&mut self) {
         self.current = None;
     }

@@ -39,17 +39,14 @@ impl TensorRegion {
         Ok(Self { id, file, bytes })
     }
 
-    /// Returns its size.
     pub(crate) fn bytes(&self) -> u64 {
         self.bytes
     }
 
-    /// Copies bytes out of the region.
     pub(crate) fn read(&self, offset: u64, copy: &mut [u8]) -> io::Result<()> {
         self.file.read_exact_at(copy, offset)
     }
 
-    /// Copies bytes into the region.
     pub(crate) fn write(&self, offset: u64, bytes: &[u8]) -> io::Result<()> {
         self.file.write_all_at(bytes, offset)
     }

@@ -23,12 +23,10 @@ pub(crate) enum WorkKind {
     Run,
 }
 
-/// Work on a model that is in progress.
 #[derive(Debug, Clone)]
 pub(crate) struct ModelWork {
     /// SHA-256 of the file.
     pub(crate) sha256: String,
-    /// Path of its file.
     pub(crate) path: String,
     /// Names of the lambdas that requested it.
     pub(crate) lambdas: Vec<String>,
@@ -54,7 +52,6 @@ impl WorkNote {
         Self { kind, file, work: Arc::default() }
     }
 
-    /// Notes the begin of work.
     pub(crate) fn begin(&self, work: ModelWork) {
         let mut note = [0; NOTE_BYTES];
         let digits = work.sha256.as_bytes();
@@ -71,13 +68,11 @@ impl WorkNote {
         }
     }
 
-    /// Notes the end of work.
     pub(crate) fn end(&self) {
         *self.lock() = None;
         self.write(&[0; NOTE_BYTES]);
     }
 
-    /// Returns whether there is work in progress.
     pub(crate) fn is_busy(&self) -> bool {
         self.lock().is_some()
     }

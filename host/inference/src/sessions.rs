@@ -13,7 +13,6 @@ const KEPT: Duration = Duration::from_secs(60);
 /// Largest number of threads of one run.
 const MAX_THREADS: u32 = 64;
 
-/// Identifies a session of this process.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub(crate) struct SessionId(u64);
 
@@ -36,7 +35,6 @@ impl SessionKey {
     }
 }
 
-/// State of a session.
 #[derive(Debug, Clone)]
 pub(crate) enum LoadState {
     Loading,
@@ -70,7 +68,6 @@ pub(crate) struct ModelSession {
     unused_since: Option<Instant>,
 }
 
-/// Counts of requests.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct RunCounts {
     pub(crate) runs: u64,
@@ -79,7 +76,6 @@ pub(crate) struct RunCounts {
     pub(crate) run_ns: u64,
 }
 
-/// All sessions.
 #[derive(Debug, Default)]
 pub(crate) struct SessionTable {
     sessions: BTreeMap<SessionId, ModelSession>,
@@ -87,7 +83,6 @@ pub(crate) struct SessionTable {
 }
 
 impl SessionTable {
-    /// Returns the session of these options.
     pub(crate) fn find(&self, key: &SessionKey) -> Option<SessionId> {
         self.sessions.iter().find(|(_, session)| session.key == *key).map(|(id, _)| *id)
     }
@@ -115,12 +110,10 @@ impl SessionTable {
         id
     }
 
-    /// Removes a session.
     pub(crate) fn remove(&mut self, id: SessionId) {
         self.sessions.remove(&id);
     }
 
-    /// Counts a request that failed.
     pub(crate) fn count_failed(&mut self, id: SessionId) {
         if let Some(session) = self.get_mut(id) {
             session.counts.failed += 1;
@@ -146,12 +139,10 @@ impl SessionTable {
         removed
     }
 
-    /// Returns the report of a session, with the names of its lambdas.
     pub(crate) fn report(&self, id: SessionId, lambdas: Vec<String>) -> Option<LoadedModel> {
         self.get(id).map(|session| session.report(lambdas))
     }
 
-    /// Returns the reports of all sessions.
     pub(crate) fn reports(&self, lambdas: impl Fn(&SessionKey) -> Vec<String>) -> Vec<LoadedModel> {
         self.sessions.values().map(|session| session.report(lambdas(&session.key))).collect()
     }

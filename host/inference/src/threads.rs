@@ -19,7 +19,6 @@ use crate::worker::{ModelWorker, RunDone, WorkerRequest};
 /// Stack of both threads: libraries follow graphs by recursion.
 const STACK_BYTES: usize = 16 << 20;
 
-/// A result of a thread.
 pub(crate) enum ThreadResult {
     Loaded(LoadDone),
     Ran(RunDone),
@@ -100,12 +99,10 @@ impl ModelThreads {
         let _ = self.runs.send(request);
     }
 
-    /// Returns the descriptor that is readable when there are results.
     pub(crate) fn wake(&self) -> &OwnedFd {
         &self.wake
     }
 
-    /// Returns the next result, if there is one.
     pub(crate) fn result(&self) -> Option<ThreadResult> {
         self.results.try_recv().ok()
     }
@@ -120,12 +117,10 @@ impl ModelThreads {
         self.threads.iter().any(JoinHandle::is_finished)
     }
 
-    /// Returns whether a thread works on a model.
     pub(crate) fn are_busy(&self) -> bool {
         self.notes.iter().any(WorkNote::is_busy)
     }
 
-    /// Returns the work that takes too long.
     pub(crate) fn overdue(&self, now: Instant) -> Option<ModelWork> {
         self.notes.iter().find_map(|note| note.overdue(now))
     }

@@ -21,17 +21,12 @@ use crate::sessions::SessionId;
 /// Time after its deadline for which a run may go on that cannot be interrupted.
 const GRACE: Duration = Duration::from_secs(2);
 
-/// A request to the thread.
 pub(crate) enum WorkerRequest {
-    /// Keep a loaded model.
     Add(SessionId, WorkerModel),
-    /// Free a model.
     Remove(SessionId),
-    /// Run a model.
     Run(RunJob),
 }
 
-/// A loaded model.
 pub(crate) struct WorkerModel {
     pub(crate) graph: Box<dyn LoadedGraph>,
     pub(crate) sha256: String,
@@ -40,7 +35,6 @@ pub(crate) struct WorkerModel {
     pub(crate) last: LastRun,
 }
 
-/// The last run of a model.
 #[derive(Default)]
 pub(crate) struct LastRun {
     inputs: Vec<TensorValue>,
@@ -53,7 +47,6 @@ struct LastResult {
     run_ns: u64,
 }
 
-/// One run.
 pub(crate) struct RunJob {
     pub(crate) job: u64,
     pub(crate) session: SessionId,
@@ -70,7 +63,6 @@ pub(crate) struct RunJob {
     pub(crate) stop: Arc<StopSignal>,
 }
 
-/// The result of a run.
 pub(crate) struct RunDone {
     pub(crate) job: u64,
     pub(crate) session: SessionId,

@@ -22,7 +22,6 @@ use crate::topics::TopicTable;
 /// Interval of checks for what no descriptor announces: writers of a topic, definitions, the end of
 /// a drive.
 const TICK: Duration = Duration::from_millis(100);
-/// Interval of the status.
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);
 /// Time that a reader waits for definitions at most.
 const DEFINITIONS_TIMEOUT: Duration = Duration::from_secs(6);
@@ -50,7 +49,6 @@ pub struct Ingress {
     tick_at: Instant,
 }
 
-/// The reason why the loop ends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum LoopEnd {
     Stopped,
@@ -113,7 +111,6 @@ impl Ingress {
         }
     }
 
-    /// Waits until something has to be done.
     fn wait(
         &mut self,
         control: &IngressServer,
@@ -169,7 +166,6 @@ impl Ingress {
         self.remove_gone();
     }
 
-    /// Handles all requests of the starter that have arrived.
     fn handle_control(&mut self, control: &mut IngressServer) -> Option<LoopEnd> {
         loop {
             match control.poll() {

@@ -23,7 +23,6 @@ impl PublishRate {
         Self { requests: REQUESTS_PER_S, bytes: BYTES_PER_S, filled: now }
     }
 
-    /// Counts a request with `bytes` bytes.
     pub(crate) fn count(&mut self, bytes: usize) {
         self.requests -= 1.0;
         self.bytes -= bytes as f64;

@@ -51,7 +51,6 @@ impl Attachment {
     }
 }
 
-/// A wait for the definitions of an attached topic.
 pub(crate) struct DefinitionsWait {
     pub(crate) id: u32,
     pub(crate) until: Instant,
@@ -64,7 +63,6 @@ struct PublishedTopic {
     max_bytes: usize,
 }
 
-/// A reader of granted topics.
 pub(crate) struct ConnectedReader {
     pub(crate) name: String,
     link: ReaderLink,
@@ -166,7 +164,6 @@ impl ConnectedReader {
         self.send(&ReaderMessage::Refused { id, reason }, None);
     }
 
-    /// Sends what waits for the reader.
     pub(crate) fn flush(&mut self) {
         if let Err(error) = self.link.flush() {
             self.disconnect(&error);

@@ -25,7 +25,6 @@ pub(crate) struct ReceivedCounts {
     pub(crate) too_big: u64,
 }
 
-/// Identifies a region of a topic.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct RegionId(u64);
 
@@ -62,7 +61,6 @@ pub(crate) struct AttachedReader {
     pub(crate) refused: u64,
 }
 
-/// A request of a reader for a region.
 pub(crate) struct AttachRequest<'a> {
     pub(crate) control: &'a ControlRegion,
     pub(crate) limits: HoldLimits,
@@ -373,7 +371,6 @@ impl SinkState {
     }
 }
 
-/// One subscription of a topic.
 pub(crate) struct SubscriptionSink {
     pub(crate) topic: Arc<TopicSink>,
     /// Number of the subscription: 0, 1, ...

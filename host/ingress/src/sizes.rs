@@ -17,7 +17,6 @@ const MOST_RESERVED: u64 = 64 << 30;
 /// size of samples, a slot is present once it was used: its first sample takes longer.
 const MOST_PRESENT: usize = 256 << 20;
 
-/// Sizes of a region.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct RegionSizes {
     pub(crate) layout: SharedLayout,

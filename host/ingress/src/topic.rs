@@ -208,7 +208,6 @@ impl SharedTopic {
         self.readers > 0
     }
 
-    /// Returns the file of a region.
     pub(crate) fn file(&self, region: RegionId) -> Option<&OwnedFd> {
         self.regions.iter().find(|(known, ..)| *known == region).map(|(_, file, _)| file)
     }

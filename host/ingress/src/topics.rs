@@ -102,7 +102,6 @@ impl TopicTable {
         self.topics.values()
     }
 
-    /// Returns the file of a reader's region.
     pub(crate) fn file(&self, key: u64, attached: &AttachedReader) -> Option<&OwnedFd> {
         self.topics.get(&key)?.file(attached.region)
     }
@@ -122,7 +121,6 @@ impl TopicTable {
     }
 }
 
-/// Converts the reason of a refused subscription.
 fn refusal(error: TransportError) -> RefusedTopic {
     match error {
         TransportError::NoSuchTopic { known, nearest, .. } => {

@@ -55,7 +55,6 @@ fn attach(control: &mut IngressControl, name: &str, grant: TopicGrant) -> (Feed,
     (feed, topic)
 }
 
-/// Waits until `is_it`.
 fn until(what: &str, mut is_it: impl FnMut() -> bool) {
     let begun = Instant::now();
     while !is_it() {

@@ -7,7 +7,7 @@
 
 use gleaner_protocol::{Holds, Layer};
 
-use crate::filter::{DeniedCalls, install};
+use crate::filter::{ALL, DeniedCalls, install};
 use crate::{JailError, Paths, base_filter, files, self_test, sockets};
 
 /// Calls on files of other processes, on owners and attributes of files, which Landlock does not
@@ -81,7 +81,7 @@ fn filter(has_network: bool) -> Result<(), JailError> {
         refused = refused.unless(*call, 0, 0);
     }
     for request in TYPING {
-        refused = refused.bits(libc::SYS_ioctl, 1, u64::from(u32::MAX), request);
+        refused = refused.bits(libc::SYS_ioctl, 1, ALL, request);
     }
     install(&refused.filter(libc::EPERM)?)
 }

@@ -11,6 +11,9 @@ use seccompiler::{
 
 use crate::JailError;
 
+/// All bits of an argument.
+pub(crate) const ALL: u64 = u32::MAX as u64;
+
 /// Bit of the numbers of the x32 ABI, by which a call can also be made on x86-64.
 #[cfg(target_arch = "x86_64")]
 const X32: i64 = 0x4000_0000;
@@ -18,7 +21,6 @@ const X32: i64 = 0x4000_0000;
 #[cfg(target_arch = "x86_64")]
 const X32_OWN: std::ops::RangeInclusive<i64> = 512..=547;
 
-/// Calls to refuse.
 #[derive(Default)]
 pub(crate) struct DeniedCalls(BTreeMap<i64, Vec<SeccompRule>>);
 

@@ -6,7 +6,7 @@
 
 use gleaner_protocol::Layer;
 
-use crate::filter::{DeniedCalls, install, install_everywhere};
+use crate::filter::{ALL, DeniedCalls, install, install_everywhere};
 use crate::{JailError, base_filter, memory, sockets};
 
 /// The name of the layer for processes.
@@ -158,9 +158,6 @@ const PAGE_ADVICE: [i32; 4] =
 /// Number of descriptors that a process may still open: files of a drive opened again, modules, and
 /// those that the ingress or the starter sends.
 const MORE_FILES: u64 = 512;
-
-/// All bits of an argument.
-const ALL: u64 = u32::MAX as u64;
 
 /// Sandboxes all threads of this process. With `only_counted_memory` it can take no memory that
 /// [`memory::limit`] does not count. Returns the layers with what they deny;

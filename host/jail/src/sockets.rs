@@ -3,7 +3,7 @@
 
 use gleaner_protocol::Layer;
 
-use crate::filter::{DeniedCalls, install};
+use crate::filter::{ALL, DeniedCalls, install};
 
 /// The name of the layer of a process that creates no sockets.
 pub const NAME: &str = "sockets";
@@ -26,8 +26,6 @@ const ALL_FAMILIES: i32 = 64;
 /// Socket types that DDS does not use: streams above all, which may connect.
 const OTHER_TYPES: [u64; 5] = [1, 4, 5, 6, 10];
 
-/// All bits of an argument.
-const ALL: u64 = u32::MAX as u64;
 /// The bits of a socket's type that are not flags.
 const TYPE: u64 = 0xf;
 

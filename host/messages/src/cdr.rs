@@ -60,7 +60,6 @@ pub enum CdrError {
     Layout(u16),
 }
 
-/// A position in a CDR payload.
 #[derive(Copy, Clone)]
 pub(super) struct Cursor<'a> {
     bytes: &'a [u8],
@@ -117,7 +116,6 @@ impl<'a> Cursor<'a> {
         self.take(n).map(|_| ())
     }
 
-    /// Returns the next `n` bytes.
     pub(super) fn take(&mut self, n: usize) -> Result<&'a [u8], CdrError> {
         let taken = self.pos.checked_add(n).and_then(|end| self.bytes.get(self.pos..end));
         match taken {

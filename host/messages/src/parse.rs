@@ -6,7 +6,6 @@
 
 use super::definitions::MessageError;
 
-/// A primitive type.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub(super) enum Primitive {
     Bool,
@@ -53,7 +52,6 @@ pub(super) enum Element<S> {
     Struct(S),
 }
 
-/// One field of a message type.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct FieldDefinition<S> {
     pub(super) name: String,

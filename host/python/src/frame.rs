@@ -1,7 +1,7 @@
 //! Frames of `gleaner:lambda/data` over `gleaner_host::api::frame`.
 
 use gleaner_host::api::frame::{self, Info};
-use gleaner_image::{Bayer, Encoding, Roi};
+use gleaner_image::{Encoding, Roi};
 use numpy::PyArray1;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict, PyTuple};
@@ -125,21 +125,8 @@ fn region((x, y, width, height): RoiFields) -> Roi {
 /// The WIT name of an encoding, with `_` for `-`.
 fn name(encoding: Encoding) -> &'static str {
     match encoding {
-        Encoding::Rgb8 => "rgb8",
-        Encoding::Bgr8 => "bgr8",
-        Encoding::Rgba8 => "rgba8",
-        Encoding::Bgra8 => "bgra8",
-        Encoding::Mono8 => "mono8",
-        Encoding::Mono16 => "mono16",
         Encoding::Yuv422Uyvy => "yuv422",
         Encoding::Yuv422Yuyv => "yuv422_yuy2",
-        Encoding::Bayer8(Bayer::Rggb) => "bayer_rggb8",
-        Encoding::Bayer8(Bayer::Bggr) => "bayer_bggr8",
-        Encoding::Bayer8(Bayer::Gbrg) => "bayer_gbrg8",
-        Encoding::Bayer8(Bayer::Grbg) => "bayer_grbg8",
-        Encoding::Bayer16(Bayer::Rggb) => "bayer_rggb16",
-        Encoding::Bayer16(Bayer::Bggr) => "bayer_bggr16",
-        Encoding::Bayer16(Bayer::Gbrg) => "bayer_gbrg16",
-        Encoding::Bayer16(Bayer::Grbg) => "bayer_grbg16",
+        same => same.name(),
     }
 }

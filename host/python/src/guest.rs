@@ -47,7 +47,6 @@ fn handler(manifest: &Manifest) -> &'static str {
     }
 }
 
-/// Limits of a call into the lambda.
 #[derive(Copy, Clone)]
 struct CallLimits {
     /// Time for the import and `init` together; 0 means no limit.

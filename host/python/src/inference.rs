@@ -50,7 +50,6 @@ type OptionFields = (Vec<String>, f32, f32, u32);
 /// Fields of `gleaner.Detection`, in their order.
 type DetectionFields = (u32, String, f32, f32, f32, f32, f32);
 
-/// Sets the session of the lambda of this process.
 pub(crate) fn use_session(session: Session) {
     *SESSION.lock().unwrap_or_else(PoisonError::into_inner) = Some(session);
 }

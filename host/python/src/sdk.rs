@@ -5,7 +5,6 @@ use pyo3::prelude::*;
 use pyo3::sync::PyOnceLock;
 use pyo3::types::PyType;
 
-/// A class of the package.
 pub(crate) struct SdkClass {
     module: &'static str,
     name: &'static str,

@@ -188,7 +188,6 @@ pub enum RecordError {
 }
 
 impl RecordError {
-    /// Returns whether the disk is full.
     pub(crate) fn is_full_disk(&self) -> bool {
         matches!(self.os_error(), Some(io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded))
     }

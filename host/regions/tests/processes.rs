@@ -59,7 +59,6 @@ struct Topic {
     bells: Vec<Bell>,
 }
 
-/// A child that reads the topic.
 struct ReaderProcess {
     child: Child,
     stdout: BufReader<ChildStdout>,

@@ -53,12 +53,10 @@ const SECRETS: [&str; 6] = ["KEY", "TOKEN", "SECRET", "PASSWORD", "PASSWD", "CRE
 /// Prefixes of the names of variables of cargo and rustc.
 const COMPILER: [&str; 2] = ["CARGO_", "RUST"];
 
-/// Returns the environment of a runtime.
 pub(crate) fn for_runtime() -> impl Iterator<Item = (OsString, OsString)> {
     env::vars_os().filter(|(name, _)| is_for_runtime(name))
 }
 
-/// Returns the environment of a compiler.
 pub(crate) fn for_compiler() -> impl Iterator<Item = (OsString, OsString)> {
     env::vars_os().filter(|(name, _)| is_of_compiler(name))
 }

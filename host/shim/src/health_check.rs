@@ -25,7 +25,6 @@ const MAX_THREADS: u64 = 512;
 /// read-only, page tables.
 const UNCOUNTED: u64 = 64 << 20;
 
-/// State of the checks of one process.
 #[derive(Default)]
 pub(crate) struct HealthCheck {
     pid: u32,
@@ -37,7 +36,6 @@ pub(crate) struct HealthCheck {
 }
 
 impl HealthCheck {
-    /// Begins the checks of process `pid`.
     pub(crate) fn of(pid: u32) -> Self {
         Self { pid, ..Self::default() }
     }

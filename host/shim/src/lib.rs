@@ -47,7 +47,7 @@ const HARD_DEADLINE: &str = "hard deadline";
 
 /// Starts a runtime in its jail, and watches it.
 #[derive(Parser)]
-#[command(name = "gleaner-shim", version)]
+#[command(name = "gleaner-shim", version = gleaner_base::version())]
 struct Args {
     /// Write the exit record to this file; `-` writes it to standard output, as the last line.
     #[arg(long, value_name = "FILE")]

@@ -16,7 +16,6 @@ use rustix::process::{
 
 const SHIM: &str = env!("CARGO_BIN_EXE_gleaner-shim");
 
-/// File of the record of one test, removed when dropped.
 struct RecordFile(PathBuf);
 
 impl RecordFile {

@@ -61,7 +61,6 @@ impl PerCall {
         Ok(piece)
     }
 
-    /// Limits of its result.
     pub(super) fn clamps(&self) -> clamps::PerCall {
         clamps::PerCall { bytes: self.bytes, items: self.items }
     }

@@ -22,7 +22,6 @@ struct CurveList {
     omitted: BTreeSet<CurveKey>,
 }
 
-/// Identity of a curve.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 struct CurveKey {
     input: String,
@@ -73,7 +72,6 @@ impl Curves {
     }
 }
 
-/// Writes one curve.
 #[derive(Default)]
 pub(super) struct CurveWriter(Mutex<CurvePoints>);
 

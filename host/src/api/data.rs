@@ -425,7 +425,6 @@ impl Topic {
         head - (oldest..head).rev().take_while(is_later).count() as u64
     }
 
-    /// Hides samples from this position on.
     pub(crate) fn hide_from(&self, position: u64) {
         self.until.store(position, Ordering::Relaxed);
         *self.newest.lock().unwrap_or_else(PoisonError::into_inner) =

@@ -310,7 +310,6 @@ impl Paid<'_> {
             .map_err(|error| source.refused(error))
     }
 
-    /// Creates a new frame.
     fn make(
         self,
         info: Info,

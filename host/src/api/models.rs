@@ -95,7 +95,6 @@ pub struct OpenedModel {
 pub(super) struct TensorBytes<T> {
     /// Name, type and shape; the offset is 0.
     pub(super) place: TensorPlace,
-    /// The elements.
     pub(super) bytes: T,
 }
 
@@ -161,7 +160,6 @@ impl Models {
         Ok((entry, state.open(name, &self.time.earliest(due))?))
     }
 
-    /// Runs a model once.
     pub(super) fn run(
         &self,
         name: &str,
@@ -213,7 +211,6 @@ impl Models {
         result
     }
 
-    /// Prepares a frame as a tensor.
     pub(super) fn prepare<P>(
         &self,
         prepare: impl FnOnce(&mut Preparer) -> Result<P, InferenceError>,

@@ -97,16 +97,10 @@ impl Topic {
 
 #[cfg(test)]
 mod tests {
-    use gleaner_lambda::manifest::Limits;
     use serde_json::json;
 
     use super::*;
-
-    fn session() -> Session {
-        let session = Session::new(Vec::new(), Vec::new(), &Limits::default());
-        session.begin(0);
-        session
-    }
+    use crate::api::trigger::tests::session;
 
     fn trigger(text: Value) -> Trigger {
         serde_json::from_value(text).unwrap()

@@ -38,7 +38,6 @@ impl SharedBytes {
         Self { len: lease.len(), start: 0, owner: BytesOwner::Decoded(lease) }
     }
 
-    /// All of `bytes`.
     pub(super) fn owned(bytes: Box<[u8]>) -> Self {
         Self { len: bytes.len(), start: 0, owner: BytesOwner::Owned(Arc::new(bytes)) }
     }

@@ -138,13 +138,13 @@ fn json(value: AttributeValue) -> Value {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use gleaner_lambda::manifest::Limits;
 
     use super::*;
 
     /// A session in the middle of a wake.
-    fn session() -> Session {
+    pub(crate) fn session() -> Session {
         let session = Session::new(Vec::new(), Vec::new(), &Limits::default());
         session.begin(0);
         session

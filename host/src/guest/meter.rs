@@ -15,7 +15,6 @@ use gleaner_vitals::{Pulse, Share, own};
 /// replay seven.
 const BETWEEN: Duration = Duration::from_millis(1);
 
-/// The meter of one lambda.
 pub(super) struct Meter {
     pages: PrivatePages,
     share: Share,

@@ -154,3 +154,10 @@ pub struct WakeOutcome {
     /// Run time of models, if they were run for another process.
     pub model_ns: Option<u64>,
 }
+
+impl WakeOutcome {
+    #[allow(dead_code, reason = "without a kind of lambda, there are no wakes")]
+    pub(crate) fn faulted(fault: Fault) -> Self {
+        Self { result: Err(fault), fuel: None, run_ns: None, model_ns: None }
+    }
+}

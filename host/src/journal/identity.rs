@@ -8,7 +8,7 @@ use gleaner_journal::{FileDigest, JournalHeader, JournalInput, TimeRange};
 use gleaner_lambda::layout::FILE_MAX;
 use gleaner_lambda::manifest::{ConfigValue, Manifest, ScheduleSpec};
 use gleaner_lambda::{BuildDir, LayoutError};
-use serde_json::{Map, Value};
+use serde_json::{Map, Value, json};
 use sha2::{Digest, Sha256};
 
 use crate::input::Remap;
@@ -87,7 +87,7 @@ impl LambdaIdentity<'_> {
             event_input: event,
             config: config
                 .iter()
-                .map(|(key, value)| (key.clone(), json(value)))
+                .map(|(key, value)| (key.clone(), json!(value)))
                 .collect::<Map<_, _>>(),
             remaps: remaps.iter().map(|remap| (remap.from.clone(), remap.to.clone())).collect(),
             clock: clock.to_owned(),
@@ -132,15 +132,6 @@ fn journal_input(input: &gleaner_lambda::manifest::InputSpec, remaps: &[Remap]) 
         topic: topic.to_owned(),
         wire_topic: Remap::apply(remaps, topic).to_owned(),
         type_name: input.type_name.to_string(),
-    }
-}
-
-fn json(value: &ConfigValue) -> Value {
-    match value {
-        ConfigValue::Bool(value) => Value::from(*value),
-        ConfigValue::Int(value) => Value::from(*value),
-        ConfigValue::Float(value) => Value::from(*value),
-        ConfigValue::Text(value) => Value::from(value.as_str()),
     }
 }
 

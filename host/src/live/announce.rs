@@ -4,13 +4,12 @@
 //! with the lambda's name before it: `{"lambda": "hello", "decision": {...}}`.
 
 use gleaner_lambda::Decision;
-use gleaner_transport::Publisher;
 use serde::Serialize;
 
 use super::topic_publisher::TopicPublisher;
 
 pub(super) struct Announcer {
-    publisher: TopicPublisher,
+    pub(super) publisher: TopicPublisher,
     lambda: String,
 }
 
@@ -21,19 +20,8 @@ struct Announced<'a> {
 }
 
 impl Announcer {
-    /// Publishes decisions of `lambda` through `publisher`.
     pub(super) fn new(publisher: TopicPublisher, lambda: &str) -> Self {
         Self { publisher, lambda: lambda.to_owned() }
-    }
-
-    /// Publishes through `publisher` from now on.
-    pub(super) fn replace_publisher(&mut self, publisher: Box<dyn Publisher>) {
-        self.publisher.replace(publisher);
-    }
-
-    /// Number of decisions that were not sent.
-    pub(super) fn unsent(&self) -> u64 {
-        self.publisher.unsent()
     }
 
     /// Publishes a decision, if it has a trigger or a fault.

@@ -155,8 +155,8 @@ impl LiveEventLoop {
 
     /// Number of messages that were not sent on requested topics.
     pub(super) fn unsent(&self) -> u64 {
-        let answers = self.round_trip.as_ref().map_or(0, RoundTrip::unsent);
-        let decisions = self.announcer.as_ref().map_or(0, Announcer::unsent);
+        let answers = self.round_trip.as_ref().map_or(0, |it| it.publisher.unsent());
+        let decisions = self.announcer.as_ref().map_or(0, |it| it.publisher.unsent());
         answers.saturating_add(decisions).saturating_add(self.feed.unsent())
     }
 
@@ -205,11 +205,11 @@ impl LiveEventLoop {
             // In the order of the grants.
             let mut index = 0;
             if let Some(round_trip) = &mut self.round_trip {
-                round_trip.replace_publisher(self.feed.publisher(index));
+                round_trip.publisher.replace(self.feed.publisher(index));
                 index += 1;
             }
             if let Some(announcer) = &mut self.announcer {
-                announcer.replace_publisher(self.feed.publisher(index));
+                announcer.publisher.replace(self.feed.publisher(index));
             }
         }
         for event in events {

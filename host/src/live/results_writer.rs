@@ -60,7 +60,6 @@ impl ResultsWriter {
         let _ = self.reports.try_send(Report::Decision(decision));
     }
 
-    /// Adds log lines.
     pub(super) fn log(&mut self, lines: Vec<LogLine>) {
         if lines.is_empty() {
             return;
@@ -78,7 +77,6 @@ impl ResultsWriter {
         self.pages.send();
     }
 
-    /// Sends waiting items.
     pub(super) fn flush(&mut self) {
         self.pages.send();
     }

@@ -8,20 +8,19 @@
 //! `gleaner play --stamp monotonic`.
 
 use gleaner_lambda::Decision;
-use gleaner_transport::{Clock, Publisher};
+use gleaner_transport::Clock;
 
 use super::topic_publisher::TopicPublisher;
 use crate::api::data::Wake;
 
 pub(super) struct RoundTrip {
-    publisher: TopicPublisher,
+    pub(super) publisher: TopicPublisher,
     clock: Clock,
     lambda: String,
     wakes: u64,
 }
 
 impl RoundTrip {
-    /// Answers the wakes of `lambda` through `publisher`.
     pub(super) fn new(publisher: TopicPublisher, clock: Clock, lambda: &str) -> Self {
         Self { publisher, clock, lambda: lambda.to_owned(), wakes: 0 }
     }
@@ -37,17 +36,6 @@ impl RoundTrip {
         }
     }
 
-    /// Publishes through `publisher` from now on.
-    pub(super) fn replace_publisher(&mut self, publisher: Box<dyn Publisher>) {
-        self.publisher.replace(publisher);
-    }
-
-    /// Number of answers that were not sent.
-    pub(super) fn unsent(&self) -> u64 {
-        self.publisher.unsent()
-    }
-
-    /// Sends the answer to one wake.
     pub(super) fn answer(&mut self, cause_ns: i64, decision: &Decision) {
         let labels: Vec<&str> =
             decision.triggers.iter().map(|trigger| trigger.label.as_str()).collect();

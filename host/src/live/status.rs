@@ -88,7 +88,6 @@ impl StatusReporter {
         }
     }
 
-    /// Counts a wake.
     pub(super) fn woke(&mut self, decision: &Decision, log_lines: usize, times: Times) {
         self.base.wakes += 1;
         self.base.triggers += decision.triggers.len() as u64;
@@ -104,7 +103,6 @@ impl StatusReporter {
         self.base.faults
     }
 
-    /// Returns whether a report is due.
     pub(super) fn is_due(&self, now: i64) -> bool {
         now.saturating_sub(self.reported) >= EVERY_NS
     }

@@ -12,12 +12,10 @@ pub(super) struct TopicPublisher {
 }
 
 impl TopicPublisher {
-    /// Publishes `topic` through `publisher`.
     pub(super) fn new(topic: String, publisher: Box<dyn Publisher>) -> Self {
         Self { topic, publisher, unsent: 0, message: CdrWriter::new() }
     }
 
-    /// Publishes through `publisher` from now on.
     pub(super) fn replace(&mut self, publisher: Box<dyn Publisher>) {
         self.publisher = publisher;
     }

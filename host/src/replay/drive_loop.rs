@@ -10,7 +10,6 @@ use crate::schedule::WakeSchedule;
 
 /// Handles the samples and wakes of a loop over a drive.
 pub(super) trait DriveHandler {
-    /// The lambda's schedule.
     fn schedule(&mut self) -> &mut WakeSchedule;
 
     /// Runs a wake that is due. Returns false to end the loop.

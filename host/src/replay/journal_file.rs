@@ -29,7 +29,6 @@ pub(super) fn open(path: &Path) -> Result<File, Failure> {
     })
 }
 
-/// A journal that cannot be locked.
 #[derive(Debug, thiserror::Error)]
 enum JournalLockError {
     #[error("another process writes or verifies journal `{}`", path.display())]
@@ -48,10 +47,6 @@ impl Explain for JournalLockError {
                 "choose a file on a file system that has locks: --journal FILE".to_owned()
             }
         })
-    }
-
-    fn exit(&self) -> Exit {
-        Exit::Internal
     }
 }
 

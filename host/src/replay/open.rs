@@ -13,7 +13,6 @@ use super::options::Drives;
 use crate::isolation::definition_dirs;
 
 impl Drives {
-    /// Finds the files of these paths.
     pub(super) fn find(named: Vec<PathBuf>) -> Result<Self, Failure> {
         let files = files_of(&named).map_err(DriveError)?;
         // A file counts as the same under any name.

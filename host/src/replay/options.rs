@@ -102,7 +102,6 @@ pub struct Drives {
     pub files: Vec<PathBuf>,
 }
 
-/// The results that a replay writes.
 pub(super) struct Results {
     /// Folder of the results.
     pub(super) out: PathBuf,

@@ -29,7 +29,6 @@ const NOTED: usize = 8;
 /// A recorder over one lambda's `[record]`.
 pub(super) struct ReplayRecorder {
     shared: Arc<Mutex<SharedRecorder>>,
-    /// The recorded topics.
     topics: Vec<Arc<TopicRecorder>>,
     rules: RecordSpec,
     /// Sentences on what all clips lack.
@@ -47,7 +46,6 @@ struct SharedRecorder {
     failed: Option<RecordError>,
 }
 
-/// One recorded topic.
 struct TopicRecorder {
     shared: Arc<Mutex<SharedRecorder>>,
     topic: TopicSchema,

@@ -241,7 +241,6 @@ struct ReplayEnd<'a> {
     wall_s: f64,
 }
 
-/// Outcome of a replay.
 pub(super) struct ReplayOutcome {
     pub(super) summary: ReplaySummary,
     /// Exit of a drive that could not be read in full.

@@ -39,7 +39,6 @@ impl SignalCollector {
         Self { curves: Curves::of(inputs), run: empty(), fuel: empty(), pictures }
     }
 
-    /// Adds a wake.
     pub(super) fn wake(&mut self, decision: &Decision) {
         self.run.saturating_record(decision.run_ns);
         if let Some(fuel) = decision.fuel {

@@ -63,7 +63,6 @@ impl FedInputs {
         Self { topics, loopback, feed, control, ingress }
     }
 
-    /// Publishes a sample of input `number`.
     fn publish(&self, number: u32, value: i64) {
         let meta = SampleMeta { writer: Guid([7; 16]), ..meta(value, value as u64) };
         let cdr = value.to_le_bytes();

@@ -2,26 +2,25 @@
 //! published decisions, without DDS, shim or sandbox.
 
 use std::fs::File;
-use std::io::{BufRead, BufReader, PipeReader, Read, pipe};
+use std::io::{BufReader, PipeReader, Read, pipe};
 use std::os::fd::OwnedFd;
 use std::os::unix::net::UnixStream;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use gleaner_base::{Exit, Failure};
 use gleaner_feed::Feed;
 use gleaner_host::api::Session;
 use gleaner_host::api::data::{Sample, Wake};
-use gleaner_host::api::models::Models;
 use gleaner_host::guest::{Guest, LambdaEngine, WakeOutcome};
 use gleaner_host::live::{LiveRun, ResultsPipe, Settings};
 use gleaner_host::session_setup::ConfiguredLambda;
 use gleaner_ingress::Ingress;
 use gleaner_lambda::manifest::Manifest;
-use gleaner_lambda::{BuildDir, Fault, FaultKind};
+use gleaner_lambda::{Fault, FaultKind};
 use gleaner_messages::Definitions;
 use gleaner_protocol::ingress::{
     AddReader, IngressControl, PublishGrant, ReceptionStatus, TopicGrant,
@@ -34,6 +33,8 @@ use gleaner_transport::{
     SampleMeta, Sink, Subscription, TopicSpec, Transport, TransportError,
 };
 use gleaner_vitals::Pulse;
+
+use crate::recorded_run::{configured, until};
 
 pub const PATIENCE: Duration = Duration::from_secs(60);
 const NUMBERS: &str = "/numbers";
@@ -205,15 +206,7 @@ impl Running {
         let run = thread::spawn(move || {
             let pulse = Pulse::create().unwrap().0;
             let run = LiveRun {
-                lambda: ConfiguredLambda {
-                    build: BuildDir::of(&folder),
-                    folder: folder.clone(),
-                    config: Vec::new(),
-                    remaps: Vec::new(),
-                    vehicle: None,
-                    models: Models::default(),
-                    passes_inference: false,
-                },
+                lambda: configured(&folder),
                 manifest,
                 settings: Settings {
                     out: folder,
@@ -310,18 +303,8 @@ impl Running {
         self.loopback.publish(NUMBERS, &meta, &value.to_le_bytes()).unwrap();
     }
 
-    /// Reads reports until `looked_for` accepts one.
-    fn until<T>(&mut self, mut looked_for: impl FnMut(Report) -> Option<T>) -> T {
-        // There is a report each second.
-        let until = Instant::now() + PATIENCE;
-        loop {
-            let mut line = String::new();
-            assert!(self.reports.read_line(&mut line).unwrap() > 0, "the reports end");
-            assert!(Instant::now() < until, "it is not reported");
-            if let Some(found) = looked_for(serde_json::from_str(&line).unwrap()) {
-                return found;
-            }
-        }
+    fn until<T>(&mut self, looked_for: impl FnMut(Report) -> Option<T>) -> T {
+        until(&mut self.reports, looked_for)
     }
 
     /// Waits for the decision of the next wake with a trigger, and returns its score.

@@ -422,7 +422,7 @@ fn grant((topic, id): (&str, u32)) -> TopicGrant {
     recorded_grant(id, topic, Some("test_msgs/msg/Number".to_owned()), Some(64 << 10), Qos::Auto)
 }
 
-fn configured(lambda: &Path) -> ConfiguredLambda {
+pub fn configured(lambda: &Path) -> ConfiguredLambda {
     ConfiguredLambda {
         build: BuildDir::of(lambda),
         folder: lambda.to_owned(),
@@ -435,7 +435,7 @@ fn configured(lambda: &Path) -> ConfiguredLambda {
 }
 
 /// Reads reports until `looked_for` accepts one.
-fn until<R: serde::de::DeserializeOwned, T>(
+pub fn until<R: serde::de::DeserializeOwned, T>(
     reports: &mut BufReader<PipeReader>,
     mut looked_for: impl FnMut(R) -> Option<T>,
 ) -> T {

@@ -189,7 +189,6 @@ impl LiveSource for Loopback {
     }
 }
 
-/// Publishes one topic of a loopback.
 struct LoopbackPublisher {
     loopback: Loopback,
     topic: String,

@@ -125,7 +125,6 @@ impl PixelOrder {
     }
 }
 
-/// A resize of one frame.
 pub(crate) struct Resize<'a> {
     buffers: &'a mut Bilinear,
     view: &'a View<'a>,

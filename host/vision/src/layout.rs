@@ -63,7 +63,6 @@ pub(crate) struct Form {
     pub(crate) classes: Option<u32>,
     /// True if the numbers of an anchor are not next to each other, but the anchors are.
     pub(crate) by_number: bool,
-    /// Strides of the grids.
     pub(crate) strides: &'static [u32],
 }
 
@@ -199,7 +198,6 @@ impl DetectorLayout {
         (is_rt_detr && columns > NMS_FREE_ROW).then_some("RT-DETR, with 300 rows")
     }
 
-    /// Returns the form of an output of `shape`.
     pub(crate) fn form(self, shape: &[u32], input: (u32, u32)) -> Result<Form, VisionError> {
         let text = || shape_text(shape.iter().copied().map(Some));
         self.form_of(shape, input).ok_or_else(|| self.refusal(input, text()))

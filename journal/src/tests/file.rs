@@ -75,7 +75,6 @@ fn a_journal_truncated_at_any_byte_has_its_complete_blocks() {
     }
 }
 
-/// Returns the length of the output so far.
 fn writer_len(writer: &mut JournalWriter<Vec<u8>>) -> usize {
     writer.flush().unwrap();
     writer.written().len()

@@ -75,7 +75,6 @@ fn end(wakes: usize) -> JournalEnd {
     JournalEnd { wakes: wakes as u64, samples: vec![5, 6], drives: Vec::new() }
 }
 
-/// Returns a random entry.
 fn any_entry(random: &mut Xorshift, inputs: usize) -> JournalEntry {
     let writer = |random: &mut Xorshift| [random.below(3) as u8; 16];
     let cause = match random.one_in(3) {

@@ -47,7 +47,7 @@ use gleaner_base::{NotPlain, PlainFile};
 use crate::Vehicle;
 
 /// Name of the manifest file.
-const FILE: &str = "lambda.toml";
+pub const MANIFEST_FILE: &str = "lambda.toml";
 
 impl Manifest {
     /// Parses the manifest `text`. `file` is its name in messages, usually `lambda.toml`.
@@ -67,7 +67,7 @@ impl Manifest {
     /// As [`parse`](Self::parse) and [`read`](Self::read).
     pub fn load(dir: impl AsRef<Path>) -> Result<Manifest, ManifestError> {
         let dir = dir.as_ref();
-        Manifest::parse(&Manifest::read(dir)?, dir.join(FILE))
+        Manifest::parse(&Manifest::read(dir)?, dir.join(MANIFEST_FILE))
     }
 
     /// Reads the text of the manifest in the folder `dir`, for callers that need its bytes as well.
@@ -78,11 +78,13 @@ impl Manifest {
     /// [`MANIFEST_MAX`](bounds::MANIFEST_MAX), or is not UTF-8.
     pub fn read(dir: impl AsRef<Path>) -> Result<String, ManifestError> {
         let dir = dir.as_ref();
-        text(&dir.join(FILE), PlainFile::inside(dir, Path::new(FILE), bounds::MANIFEST_MAX))
+        text(
+            &dir.join(MANIFEST_FILE),
+            PlainFile::inside(dir, Path::new(MANIFEST_FILE), bounds::MANIFEST_MAX),
+        )
     }
 }
 
-/// Parses the configuration of a vehicle in `text`.
 pub(crate) fn vehicle(text: &str, file: &str) -> Result<Vehicle, ManifestError> {
     read_vehicle::vehicle(&table::Document { text, file })
 }

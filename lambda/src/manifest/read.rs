@@ -23,7 +23,6 @@ type Result<T> = std::result::Result<T, ManifestError>;
 const WRITTEN: [&str; 7] =
     ["lambda.toml", "wheels", "build", "out", "live", "revision.json", "environment"];
 
-/// Parses the manifest in `document`.
 pub(super) fn manifest(document: &Document) -> Result<Manifest> {
     let entries =
         DeTable::parse(document.text).map_err(|error| syntax::explain(document, &error))?;

@@ -27,7 +27,6 @@ const DOMAINS: RangeInclusive<u64> = 0..=232;
 /// Length of a label's value in bytes, as in a signed selector.
 const LABEL_MAX: usize = 128;
 
-/// Parses the configuration of a vehicle.
 pub(super) fn vehicle(document: &Document) -> Result<Vehicle> {
     let entries =
         DeTable::parse(document.text).map_err(|error| syntax::explain(document, &error))?;

@@ -81,7 +81,6 @@ pub(super) struct Section {
     pub(super) keys: Vec<Key>,
 }
 
-/// A key in a table.
 pub(super) struct Key {
     pub(super) name: &'static str,
     form: String,

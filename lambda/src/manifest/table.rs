@@ -28,7 +28,6 @@ impl Document<'_> {
     }
 }
 
-/// A table of a TOML document.
 pub(super) struct TomlTable<'a> {
     pub(super) document: &'a Document<'a>,
     /// The path of its keys, for example `schedule`; empty at the top.
@@ -50,7 +49,6 @@ impl<'a> TomlTable<'a> {
             .check_keys(known)
     }
 
-    /// Refuses keys other than `known`.
     pub(super) fn check_keys(self, known: &'static [&'static str]) -> Result<TomlTable<'a>> {
         let Some(value) = self.entries().into_iter().find(|value| !known.contains(&value.name))
         else {

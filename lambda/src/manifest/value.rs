@@ -128,7 +128,6 @@ impl<'a> TomlValue<'a> {
         }
     }
 
-    /// Parses a text of a certain form.
     pub(super) fn parse<T: FromStr<Err = NameError>>(&self) -> Result<T> {
         let text = self.text()?;
         text.parse().map_err(|NameError { what, rule, .. }| self.wrong_form(text, what, rule))

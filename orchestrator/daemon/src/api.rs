@@ -84,7 +84,6 @@ struct LeaveQuery {
 type Reply<T> = Result<T, ApiError>;
 
 impl Api {
-    /// Returns the routes.
     pub(crate) fn router(self) -> Router {
         Router::new()
             .route("/v1/status", get(status))
@@ -103,7 +102,6 @@ impl Api {
             .with_state(self)
     }
 
-    /// Returns the route of the metrics alone.
     pub(crate) fn metrics_router(self) -> Router {
         Router::new().route("/metrics", get(prometheus)).with_state(self)
     }
@@ -116,7 +114,7 @@ impl Api {
             key: self.key.to_string(),
             labels: labels.into_iter().map(|(name, value)| (name.to_string(), value)).collect(),
             orchestrator: ProgramStatus {
-                version: env!("CARGO_PKG_VERSION").to_owned(),
+                version: gleaner_base::version().to_owned(),
                 pid: std::process::id(),
                 up_s: self.started.elapsed().as_secs_f64(),
                 rss_bytes: usage::resident(),

@@ -57,7 +57,6 @@ impl SignedDeployment {
         &self.deployment.payload().id
     }
 
-    /// Returns the digests of its revisions.
     pub(crate) fn digests(&self) -> impl Iterator<Item = &Sha256> {
         self.revisions().map(Trusted::digest)
     }

@@ -132,7 +132,6 @@ impl Core {
         Ok(core)
     }
 
-    /// Returns the wanted state, as it changes.
     pub(crate) fn desired(&self) -> watch::Receiver<DesiredState> {
         self.desired.subscribe()
     }
@@ -147,7 +146,6 @@ impl Core {
         });
     }
 
-    /// Calls `read` with the trust of the vehicle.
     pub(crate) fn trust<T>(&self, read: impl FnOnce(&VehicleTrust) -> T) -> T {
         read(&self.lock().trust)
     }

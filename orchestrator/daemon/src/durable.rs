@@ -20,7 +20,6 @@ pub(crate) struct DurableFile {
     paths: [PathBuf; 2],
 }
 
-/// A value that was read.
 #[derive(Debug, PartialEq)]
 pub(crate) struct Loaded<T> {
     /// The value; `None` if neither copy exists.

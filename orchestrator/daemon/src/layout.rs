@@ -108,54 +108,6 @@ impl VehicleFolders {
         Ok((file, is_free))
     }
 
-    pub(crate) fn trust(&self) -> PathBuf {
-        self.state.join("trust.json")
-    }
-
-    pub(crate) fn state_file(&self) -> PathBuf {
-        self.state.join("state.json")
-    }
-
-    /// The enrolment at the cloud.
-    pub(crate) fn cloud(&self) -> PathBuf {
-        self.state.join("cloud.json")
-    }
-
-    /// File of the measurements.
-    pub(crate) fn measured(&self) -> PathBuf {
-        self.state.join("measured.json")
-    }
-
-    /// The key that signs clips.
-    pub(crate) fn key(&self) -> PathBuf {
-        self.state.join("vehicle.pem")
-    }
-
-    /// Folder of files that were sent, and belong to no revision yet.
-    pub(crate) fn objects(&self) -> PathBuf {
-        self.state.join("objects")
-    }
-
-    pub(crate) fn revisions(&self) -> PathBuf {
-        self.state.join("revisions")
-    }
-
-    pub(crate) fn spool(&self) -> PathBuf {
-        self.state.join("spool")
-    }
-
-    pub(crate) fn records(&self) -> PathBuf {
-        self.state.join("records")
-    }
-
-    pub(crate) fn clips(&self) -> PathBuf {
-        self.state.join("clips")
-    }
-
-    pub(crate) fn cache(&self) -> PathBuf {
-        self.state.join("cache")
-    }
-
     pub(crate) fn control_socket(&self) -> PathBuf {
         self.run.join(gleaner_protocol::vehicle_api::API_SOCKET)
     }
@@ -163,6 +115,33 @@ impl VehicleFolders {
     pub(crate) fn supervisor_socket(&self) -> PathBuf {
         self.run.join("supervisor.sock")
     }
+}
+
+/// Defines methods that return paths in the state folder.
+macro_rules! state_paths {
+    ($($(#[$doc:meta])* $method:ident => $name:literal,)+) => {
+        impl VehicleFolders {
+            $($(#[$doc])* pub(crate) fn $method(&self) -> PathBuf { self.state.join($name) })+
+        }
+    };
+}
+
+state_paths! {
+    trust => "trust.json",
+    state_file => "state.json",
+    /// The enrolment at the cloud.
+    cloud => "cloud.json",
+    /// File of the measurements.
+    measured => "measured.json",
+    /// The key that signs clips.
+    key => "vehicle.pem",
+    /// Folder of files that were sent, and belong to no revision yet.
+    objects => "objects",
+    revisions => "revisions",
+    spool => "spool",
+    records => "records",
+    clips => "clips",
+    cache => "cache",
 }
 
 fn cannot_create(path: &Path, error: &io::Error) -> Failure {

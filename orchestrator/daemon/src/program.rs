@@ -30,7 +30,7 @@ use crate::link::SupervisorLink;
 /// Runs what is deployed on this vehicle, until SIGTERM, which ends all lambdas in order. After
 /// SIGHUP it replaces itself by the program that is installed now, and the lambdas run on.
 #[derive(Parser, Debug)]
-#[command(name = "gleaner-orchestrator", version)]
+#[command(name = "gleaner-orchestrator", version = gleaner_base::version())]
 struct Args {
     /// Configuration file of the vehicle; see docs/vehicle.md
     #[arg(long, value_name = "FILE")]
@@ -67,10 +67,10 @@ enum ProgramEnd {
 
 /// Runs the program.
 pub fn main() -> ExitCode {
+    let args = Args::parse();
     log::init_service();
     // Each connection takes one; the usual limit is low.
     gleaner_base::raise_open_files();
-    let args = Args::parse();
     loop {
         match run(&args) {
             Ok(ProgramEnd::Stopped) => return Exit::Ok.into(),

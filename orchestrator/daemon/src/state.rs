@@ -53,7 +53,6 @@ impl VehicleState {
     }
 }
 
-/// An accepted deployment.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Deployed {

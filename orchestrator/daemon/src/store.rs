@@ -71,7 +71,6 @@ impl RevisionStore {
         self.revisions.join(digest.as_str())
     }
 
-    /// Returns the path of the envelope of a revision.
     pub(crate) fn envelope_path(&self, digest: &Sha256) -> PathBuf {
         self.folder(digest).join(ENVELOPE)
     }
@@ -224,7 +223,6 @@ impl RevisionStore {
         Ok(unused.len())
     }
 
-    /// Lists the files of all revisions.
     pub(crate) fn known_files(&self) -> KnownFiles {
         let mut known = BTreeMap::new();
         for folder in entries(&self.revisions).unwrap_or_default() {
@@ -251,7 +249,6 @@ fn copy(from: &Path, to: &Path) -> io::Result<()> {
     target.sync_all()
 }
 
-/// Lists the paths in a folder.
 pub(crate) fn entries(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
     let listed = fs::read_dir(folder)
         .and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect::<io::Result<_>>());

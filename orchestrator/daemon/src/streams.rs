@@ -46,6 +46,7 @@ pub(crate) fn lines(spool: &Path, names: &[&str], query: &StreamQuery) -> Result
             from: query.from,
             reader: None,
             last: Default::default(),
+            has_failed: false,
         })
         .collect();
     readers.iter_mut().try_for_each(StreamReader::open)?;
@@ -70,6 +71,8 @@ struct StreamReader {
     reader: Option<SpoolReader>,
     /// Boot and time of its last record that has them.
     last: (String, u64),
+    /// True if the last look at it ended with an error.
+    has_failed: bool,
 }
 
 impl StreamReader {
@@ -119,11 +122,18 @@ fn send(
         for stream in &mut readers {
             // A failure is shown by the next request.
             let _ = stream.open();
-            let StreamReader { name, reader: Some(reader), last: before, .. } = stream else {
+            let StreamReader { name, reader: Some(reader), last: before, has_failed, .. } = stream
+            else {
                 continue;
             };
             let mut kept = VecDeque::new();
             for item in reader.by_ref() {
+                // It would come without end. The next look tries again, and shows it no more.
+                let is_failure = item.is_err();
+                if is_failure && *has_failed {
+                    break;
+                }
+                *has_failed = is_failure;
                 kept.push_back(line(name, item));
                 match last {
                     Some(last) if kept.len() > last => {
@@ -131,6 +141,9 @@ fn send(
                     }
                     None if kept.len() >= PIECE && !send_piece(&mut kept, to) => return,
                     _ => {}
+                }
+                if is_failure {
+                    break;
                 }
             }
             round.push(placed(kept, before));
@@ -221,7 +234,6 @@ fn send_piece(lines: &mut VecDeque<StreamLine>, to: &mpsc::Sender<Bytes>) -> boo
     to.blocking_send(text.into()).is_ok()
 }
 
-/// Returns the line of an item of a stream.
 pub(crate) fn line(stream: &str, item: Result<SpoolItem, gleaner_spool::SpoolError>) -> StreamLine {
     let line = |seq, kind: &str, record| StreamLine {
         stream: stream.to_owned(),
@@ -269,6 +281,11 @@ fn content(stream: &str, record: &SpoolRecord) -> (String, Value) {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+    use std::num::NonZeroU8;
+
+    use gleaner_spool::{BUDGET_MIN, BootId, SpoolConfig, SpoolTime, SpoolWriter};
+
     use super::*;
 
     fn stream(name: &str, lines: &[(&str, u64)]) -> VecDeque<StreamLine> {
@@ -282,6 +299,43 @@ mod tests {
             record: Value::Null,
         });
         lines.collect()
+    }
+
+    #[test]
+    fn a_segment_that_cannot_be_read_is_named_once_and_ends_the_list() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("events");
+        let config =
+            SpoolConfig { stream: "events".to_owned(), boot: BootId([1; 16]), budget: BUDGET_MIN };
+        let mut writer = SpoolWriter::open(&path, config).unwrap();
+        let time = SpoolTime { since_boot_ns: 1, wall_ns: 1 };
+        writer.append(NonZeroU8::MIN, time, b"x").unwrap();
+        writer.commit().unwrap();
+        drop(writer);
+        let entries = fs::read_dir(&path).unwrap().map(|entry| entry.unwrap().path());
+        let segment = entries.into_iter().find(|it| it.extension().is_some_and(|it| it == "seg"));
+        let segment = segment.unwrap();
+        fs::remove_file(&segment).unwrap();
+        fs::create_dir(&segment).unwrap();
+        for last in [None, Some(9)] {
+            let mut reader = StreamReader {
+                folder: path.clone(),
+                name: "events".to_owned(),
+                from: None,
+                reader: None,
+                last: Default::default(),
+                has_failed: false,
+            };
+            reader.open().unwrap();
+            let (to, mut from) = mpsc::channel(9);
+            send(vec![reader], last, false, &to);
+            drop(to);
+            let pieces = std::iter::from_fn(|| from.blocking_recv());
+            let text = String::from_utf8(pieces.flatten().collect()).unwrap();
+            let lines: Vec<StreamLine> =
+                text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+            assert!(lines.len() == 1 && lines[0].kind == "damaged", "{text}");
+        }
     }
 
     #[test]

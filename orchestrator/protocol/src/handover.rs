@@ -6,9 +6,10 @@ use rustix::io::Errno;
 use serde::{Deserialize, Serialize};
 
 use crate::link::frame::{self, tag};
-use crate::link::{FrameReceiver, Incoming, LinkError, ReceivedFrame, send_frame, try_send_frame};
+use crate::link::{
+    FrameReceiver, Incoming, LinkError, ReceivedFrame, STARTER, send_frame, try_send_frame,
+};
 
-const STARTER: &str = "the starter";
 const PROGRAM: &str = "the started program";
 
 /// Connections that a starter passes to a program over the socket that is its standard input.
@@ -94,9 +95,7 @@ impl Handover {
         let (connections, descriptors): (Vec<ConnectionName>, Vec<BorrowedFd<'_>>) =
             all.iter().filter_map(|(name, fd)| Some((*name, fd.as_ref()?.as_fd()))).unzip();
         let text = HandoverText { version: VERSION.to_owned(), connections };
-        let payload = serde_json::to_vec(&text)
-            .map_err(|error| LinkError::Socket { peer: PROGRAM, source: error.into() })?;
-        Ok((frame::encode(tag::HANDOVER, &payload), descriptors))
+        Ok((frame::encode_json(tag::HANDOVER, &text, STARTER, PROGRAM)?, descriptors))
     }
 
     /// Waits for the next message of the starter.
@@ -192,11 +191,7 @@ impl HandoverReceiver {
     ///
     /// Those of [`Handover::receive`]; nothing can be read after one.
     pub fn poll(&mut self) -> Result<Incoming<Handover>, LinkError> {
-        Ok(match self.frames.poll(&self.socket)? {
-            Incoming::Message(frame) => Incoming::Message(Handover::of(frame)?),
-            Incoming::Nothing => Incoming::Nothing,
-            Incoming::Ended => Incoming::Ended,
-        })
+        self.frames.poll(&self.socket, Handover::of)
     }
 }
 

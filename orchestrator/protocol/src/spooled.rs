@@ -101,43 +101,27 @@ pub struct OmittedRecord {
 
 /// The reason why a payload is not a [`SpooledRecord`]. A reader counts it, and continues.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs)]
 pub enum SpooledRecordError {
     /// The kind is that of another version, or of another stream.
     #[error("kind {kind} of a record is unknown")]
-    Kind {
-        /// The kind.
-        kind: u8,
-    },
-    /// The payload is too long to be parsed.
+    Kind { kind: u8 },
     #[error("a record of kind {kind} has {bytes} bytes, above the maximum of {PAYLOAD_MAX}")]
-    TooLong {
-        /// The kind.
-        kind: u8,
-        /// Length of the payload.
-        bytes: usize,
-    },
+    TooLong { kind: u8, bytes: usize },
     /// The payload is not the JSON of its kind.
     #[error("a record of kind {kind} is invalid")]
-    Payload {
-        /// The kind.
-        kind: u8,
-        /// The cause.
-        source: serde_json::Error,
-    },
+    Payload { kind: u8, source: serde_json::Error },
 }
 
 /// The reason why a text is not a [`ProcessOrigin`].
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs)]
 pub enum OriginError {
     /// It is not JSON with exactly the keys of an origin.
     #[error("{0}")]
     Json(#[from] serde_json::Error),
-    /// A text is empty, too long, or has control characters.
     #[error("`{key}` must have 1 to {ORIGIN_TEXT_MAX} bytes without control characters")]
-    Text {
-        /// Its key.
-        key: &'static str,
-    },
+    Text { key: &'static str },
 }
 
 impl SpooledRecord {
@@ -220,7 +204,7 @@ impl ProcessOrigin {
             generation: self.generation,
             start: self.start,
             pid,
-            software: env!("CARGO_PKG_VERSION").to_owned(),
+            software: gleaner_base::version().to_owned(),
         }
     }
 }

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use gleaner_base::{Exit, Failure};
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::supervision::{LambdaStatus, SupervisorStatus};
 
@@ -44,8 +44,13 @@ pub struct VehicleStatus {
     #[serde(default)]
     pub cloud: Option<CloudStatus>,
     /// Time since the vehicle reported it, in s; only a cloud states it.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(default, skip_serializing_if = "Option::is_none", deserialize_with = "number")]
     pub age_s: Option<f64>,
+}
+
+/// Deserialises a number. Only a missing one is none: null is an error.
+fn number<'de, D: Deserializer<'de>>(from: D) -> Result<Option<f64>, D::Error> {
+    f64::deserialize(from).map(Some)
 }
 
 /// The connection of a vehicle to the cloud.
@@ -56,8 +61,12 @@ pub struct CloudStatus {
     pub address: String,
     /// Its state: `connecting`, `connected`, or `refused` by the cloud.
     pub state: String,
-    /// The reason why it is not connected, as far as it is known.
+    /// The reason why it is not connected, if it is known. While it is connected: a stream whose
+    /// records cannot be sent; `unsent` does not count these.
     pub reason: Option<String>,
+    /// Help for the user with that reason.
+    #[serde(default)]
+    pub help: Option<String>,
     /// Time in this state, in s.
     pub since_s: f64,
     /// Number of the newest wanted state of the cloud that was handled.
@@ -327,5 +336,16 @@ impl From<Problem> for Failure {
     fn from(Problem { title, causes, help, exit, .. }: Problem) -> Self {
         let exit = Exit::from_code(exit.into()).filter(|exit| *exit != Exit::Ok);
         Failure { exit: exit.unwrap_or(Exit::Internal), message: title, causes, help }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_age_without_a_number_is_refused() {
+        let error = serde_json::from_str::<VehicleStatus>(r#"{"age_s":null}"#).unwrap_err();
+        assert!(error.to_string().starts_with("invalid type: null"), "{error}");
     }
 }

@@ -9,99 +9,40 @@ use crate::GapReason;
 use crate::format::{NAME_MAX, VERSION, segment_name};
 use crate::writer::BUDGET_MIN;
 
-/// The reason why a spool refuses a record, or cannot be used.
+/// The reason why a spool refuses a record, or cannot be used. `stream` is the name of the stream,
+/// and `first` the first sequence number of a segment.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs)]
 pub enum SpoolError {
-    /// The name of the stream is empty or too long.
     #[error("`{stream}` is not the name of a stream: it has {} bytes", stream.len())]
-    Name {
-        /// The name.
-        stream: String,
-    },
-    /// The budget is too small.
+    Name { stream: String },
     #[error("the budget of stream `{stream}` is {budget}, below the minimum of {BUDGET_MIN}")]
-    Budget {
-        /// Name of the stream.
-        stream: String,
-        /// The budget.
-        budget: ByteSize,
-    },
-    /// The folder cannot be used.
+    Budget { stream: String, budget: ByteSize },
     #[error("cannot use the spool folder `{}`", path.display())]
-    Folder {
-        /// The folder.
-        path: PathBuf,
-        /// The cause.
-        source: io::Error,
-    },
-    /// Another writer has the stream.
+    Folder { path: PathBuf, source: io::Error },
+    /// Another writer has the stream, the process `pid` if the kernel lists it.
     #[error("another writer uses the spool folder `{}`{}", path.display(), by(*pid))]
-    Busy {
-        /// The folder.
-        path: PathBuf,
-        /// Process id of the writer, if the kernel lists it.
-        pid: Option<u32>,
-    },
-    /// The segments of a stream cannot be read.
+    Busy { path: PathBuf, pid: Option<u32> },
+    /// The segment with this first sequence number cannot be read, or the folder without one.
     #[error("cannot read {} of stream `{stream}`", part(*segment))]
-    Read {
-        /// Name of the stream.
-        stream: String,
-        /// First sequence number of the segment; `None` if the folder cannot be read.
-        segment: Option<u64>,
-        /// The cause.
-        source: io::Error,
-    },
-    /// A segment has another version of the format.
+    Read { stream: String, segment: Option<u64>, source: io::Error },
     #[error(
         "segment {first} of stream `{stream}` has version {found}; this gleaner reads {VERSION}"
     )]
-    Version {
-        /// Name of the stream.
-        stream: String,
-        /// First sequence number of the segment.
-        first: u64,
-        /// Version of the segment.
-        found: u16,
-    },
+    Version { stream: String, first: u64, found: u16 },
     /// The last segment has numbers so high that new records might get none.
     #[error("{} of stream `{stream}` leaves too few numbers", part(Some(*first)))]
-    Numbers {
-        /// Name of the stream.
-        stream: String,
-        /// First sequence number of the segment.
-        first: u64,
-    },
-    /// A commit failed: its records are not acknowledged. They stay in the queue.
+    Numbers { stream: String, first: u64 },
+    /// A commit failed: records from number `durable` on are not acknowledged. They stay in the
+    /// queue.
     #[error("cannot write records {durable} and later of stream `{stream}`")]
-    Write {
-        /// Name of the stream.
-        stream: String,
-        /// First number that is not acknowledged.
-        durable: u64,
-        /// The cause.
-        source: io::Error,
-    },
-    /// The record is longer than a record of this stream may be. It has no number.
+    Write { stream: String, durable: u64, source: io::Error },
+    /// The payload is longer than one of this stream may be. The record has no number.
     #[error("a record of stream `{stream}` has {bytes} bytes, above the maximum of {most}")]
-    TooLong {
-        /// Name of the stream.
-        stream: String,
-        /// Length of the payload.
-        bytes: usize,
-        /// Maximum length of the payload.
-        most: usize,
-    },
+    TooLong { stream: String, bytes: usize, most: usize },
     /// The queue is full. The record is lost, and counted; a gap record will have its number.
     #[error("record {seq} of stream `{stream}` was refused: {}", refusal(*reason))]
-    Refused {
-        /// Name of the stream.
-        stream: String,
-        /// Number of the record.
-        seq: u64,
-        /// The reason.
-        reason: GapReason,
-    },
+    Refused { stream: String, seq: u64, reason: GapReason },
 }
 
 fn by(pid: Option<u32>) -> String {

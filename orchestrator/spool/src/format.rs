@@ -27,7 +27,6 @@ pub(crate) const SEGMENT_MAX: u64 = 4 << 20;
 /// Sequence numbers are below it, so that sums with a length never overflow.
 pub(crate) const SEQ_END: u64 = 1 << 63;
 
-/// Name of the file of a segment.
 pub(crate) fn segment_name(first: u64) -> String {
     format!("{first:020}.seg")
 }

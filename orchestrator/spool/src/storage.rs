@@ -2,7 +2,8 @@
 
 use std::io;
 
-/// The folder of one stream. Segments are named by their first sequence number.
+/// The folder of one stream. Segments are named by their first sequence number. Each operation
+/// fails with the errors of the file system.
 pub trait SpoolStorage {
     /// An open segment.
     type File: SegmentFile;
@@ -16,19 +17,11 @@ pub trait SpoolStorage {
 
     /// Lists the first sequence numbers of all segments, in ascending order, for readers. Unlike
     /// [`list`](Self::list), it need not look at each file.
-    ///
-    /// # Errors
-    ///
-    /// Those of the file system.
     fn names(&self) -> io::Result<Vec<u64>> {
         Ok(self.list()?.into_iter().map(|(first, _)| first).collect())
     }
 
     /// Creates a segment, in place of any of the same name.
-    ///
-    /// # Errors
-    ///
-    /// Those of the file system.
     fn create(&self, first: u64) -> io::Result<Self::File>;
 
     /// Opens a segment for reading.
@@ -39,68 +32,36 @@ pub trait SpoolStorage {
     fn open(&self, first: u64) -> io::Result<Self::File>;
 
     /// Removes a segment.
-    ///
-    /// # Errors
-    ///
-    /// Those of the file system.
     fn remove(&self, first: u64) -> io::Result<()>;
 
     /// Makes the names of segments durable.
-    ///
-    /// # Errors
-    ///
-    /// Those of the file system.
     fn sync_names(&self) -> io::Result<()>;
 
     /// Returns the first number that the consumer of the stream may still need, of the last
     /// [`release`](Self::release); 0 without one.
-    ///
-    /// # Errors
-    ///
-    /// Those of the file system.
     fn released(&self) -> io::Result<u64> {
         Ok(0)
     }
 
     /// Notes that the consumer has stored all records below `before` elsewhere. A power cut may
     /// take the note.
-    ///
-    /// # Errors
-    ///
-    /// Those of the file system.
     fn release(&self, _before: u64) -> io::Result<()> {
         Ok(())
     }
 }
 
-/// An open segment.
+/// An open segment. Each operation fails with the errors of the file system.
 pub trait SegmentFile {
     /// Returns the length in bytes.
-    ///
-    /// # Errors
-    ///
-    /// Those of the file system.
     fn length(&self) -> io::Result<u64>;
 
     /// Returns whether the file still has a name: it was neither removed nor replaced.
-    ///
-    /// # Errors
-    ///
-    /// Those of the file system.
     fn is_linked(&self) -> io::Result<bool>;
 
     /// Reads at `offset` as [`std::os::unix::fs::FileExt::read_at`] does; 0 bytes are the end.
-    ///
-    /// # Errors
-    ///
-    /// Those of the file system.
     fn read_at(&self, into: &mut [u8], offset: u64) -> io::Result<usize>;
 
     /// Writes all `bytes` at the end. After an error, a part of them may be in the file.
-    ///
-    /// # Errors
-    ///
-    /// Those of the file system.
     fn append(&mut self, bytes: &[u8]) -> io::Result<()>;
 
     /// Makes content and length durable (`fdatasync`).

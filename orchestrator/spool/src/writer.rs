@@ -164,6 +164,10 @@ impl<S: SpoolStorage> SpoolWriter<S> {
                 return Err(SpoolError::Numbers { stream: writer.config.stream, first });
             }
         }
+        // Numbers that a disk has lost are used again, and were not released.
+        if writer.storage.released().is_ok_and(|released| released > writer.next) {
+            let _ = writer.storage.release(writer.durable);
+        }
         Ok(writer)
     }
 
@@ -195,10 +199,6 @@ impl<S: SpoolStorage> SpoolWriter<S> {
             }
         }
         self.durable = self.recovered.map_or(self.next, |torn| torn.from);
-        // Numbers that a disk has lost are used again, and were not released.
-        if self.storage.released().is_ok_and(|released| released > self.next) {
-            let _ = self.storage.release(self.durable);
-        }
         Ok(())
     }
 

@@ -18,7 +18,6 @@ pub(crate) fn ingress(spec: &RunSpec, largest: u64, offset_ns: i64) -> Vec<OsStr
     line
 }
 
-/// Returns the arguments of a lambda's runtime.
 pub(crate) fn runtime(
     spec: &RunSpec,
     lambda: &LambdaSpec,
@@ -37,7 +36,6 @@ pub(crate) fn runtime(
     line
 }
 
-/// Returns the arguments of the runtime's shim.
 pub(crate) fn shim(spec: &RunSpec, lambda: &LambdaSpec, restarts: u32) -> Vec<OsString> {
     let mut line = vec![option("--exit-record", lambda.exit_record()), starter()];
     match (&lambda.deployment, &spec.spool) {
@@ -62,7 +60,6 @@ pub(crate) fn shim(spec: &RunSpec, lambda: &LambdaSpec, restarts: u32) -> Vec<Os
     line
 }
 
-/// Returns the recorder's arguments.
 pub(crate) fn recorder<'a>(
     spec: &RunSpec,
     recorded: impl Iterator<Item = &'a LambdaSpec>,

@@ -6,7 +6,6 @@ use gleaner_base::Exit;
 
 use crate::process::ended;
 
-/// The end of a process group.
 pub(crate) enum GroupEnd {
     /// It ended on request, its time or its drive was over, or no lambda could start.
     Complete,

@@ -33,15 +33,6 @@ pub(crate) struct IngressProcess {
 }
 
 impl IngressProcess {
-    /// Starts the ingress. `largest` is the largest sample of an input, in bytes.
-    pub(crate) fn start(
-        context: &RunContext<'_>,
-        largest: u64,
-        sender: &SyncSender<ChildOutput>,
-    ) -> Result<Self, Failure> {
-        Self::start_after(None, context, largest, sender)
-    }
-
     /// Starts another one after this one has ended; also returns the last status of this one.
     pub(crate) fn start_again(
         &mut self,
@@ -49,12 +40,14 @@ impl IngressProcess {
         largest: u64,
         sender: &SyncSender<ChildOutput>,
     ) -> Result<Option<Box<IngressStatus>>, Failure> {
-        let next = Self::start_after(Some(self), context, largest, sender)?;
+        let next = Self::start(Some(&*self), context, largest, sender)?;
         Ok(std::mem::replace(self, next).status)
     }
 
-    fn start_after(
-        before: Option<&mut Self>,
+    /// Starts the ingress, after `before` has ended. `largest` is the largest sample of an input,
+    /// in bytes.
+    pub(crate) fn start(
+        before: Option<&Self>,
         context: &RunContext<'_>,
         largest: u64,
         sender: &SyncSender<ChildOutput>,

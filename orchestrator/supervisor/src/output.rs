@@ -36,7 +36,6 @@ pub(crate) enum ChildId {
     Lambda { process: u32 },
 }
 
-/// Output of a process.
 pub(crate) struct ChildOutput {
     pub(crate) from: ChildId,
     pub(crate) piece: OutputPiece,

@@ -39,7 +39,6 @@ pub(crate) struct RunRecord<'a> {
     pub(crate) counts: &'a mut RunCounts,
 }
 
-/// The processes of a run.
 pub(crate) struct ProcessGroup<'a> {
     pub(crate) context: &'a RunContext<'a>,
     pub(crate) lambdas: &'a mut Vec<SupervisedLambda>,
@@ -73,7 +72,7 @@ impl<'a> ProcessGroup<'a> {
     ) -> Result<Self, Failure> {
         let (sender, output) = mpsc::sync_channel(QUEUE_LENGTH);
         let largest = largest(lambdas).max(context.spec.largest);
-        let ingress = IngressProcess::start(context, largest, &sender)?;
+        let ingress = IngressProcess::start(None, context, largest, &sender)?;
         let mut group = Self {
             context,
             lambdas,

@@ -36,8 +36,6 @@ pub fn reconcile(desired: &DesiredState, known: &[KnownLambda<'_>]) -> Vec<Actio
 
 #[cfg(test)]
 mod tests {
-    use std::path::PathBuf;
-
     use super::*;
     use crate::random::XorShift64;
 
@@ -46,10 +44,8 @@ mod tests {
             id: id.to_owned(),
             name: format!("name-{id}"),
             revision: revision.to_owned(),
-            folder: PathBuf::new(),
-            envelope: PathBuf::new(),
-            set: Vec::new(),
             attempt: 1,
+            ..DesiredLambda::default()
         }
     }
 

@@ -51,7 +51,6 @@ impl RevisionCheck {
         Self { result }
     }
 
-    /// Returns a check that has ended with this result.
     #[cfg(test)]
     pub(crate) fn ended(result: CheckResult) -> Self {
         let (sender, received) = sync_channel(1);
@@ -59,7 +58,6 @@ impl RevisionCheck {
         Self { result: received }
     }
 
-    /// Returns the result, once it is there.
     pub(crate) fn result(&self) -> Option<CheckResult> {
         match self.result.try_recv() {
             Ok(result) => Some(result),

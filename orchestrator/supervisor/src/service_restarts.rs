@@ -28,7 +28,6 @@ pub(crate) struct ServiceRestarts {
     error: LastError,
 }
 
-/// An end that this program has requested.
 #[derive(Debug)]
 struct RequestedEnd {
     reason: String,
@@ -37,12 +36,10 @@ struct RequestedEnd {
 }
 
 impl ServiceRestarts {
-    /// Begins with the first process.
     pub(crate) fn first() -> Self {
         Self::with(0, ServiceDelays::new())
     }
 
-    /// Continues with the next process.
     pub(crate) fn next(&self) -> Self {
         Self::with(self.start + 1, self.delays.clone())
     }
@@ -76,7 +73,6 @@ impl ServiceRestarts {
         self.again_at.is_some_and(|at| Instant::now() >= at)
     }
 
-    /// Notes a report.
     pub(crate) fn reports(&mut self) {
         self.reported = Instant::now();
     }
@@ -102,7 +98,6 @@ impl ServiceRestarts {
         self.requested.get_or_insert(RequestedEnd { reason, has_failed: false });
     }
 
-    /// Returns the reason of its end.
     pub(crate) fn reason(&self, name: &str, status: ExitStatus) -> String {
         match (&self.requested, self.error.in_one_line()) {
             (Some(requested), _) => requested.reason.clone(),

@@ -208,7 +208,6 @@ impl SupervisedLambda {
         matches!(self.state, LambdaState::NotStarted)
     }
 
-    /// Sets the process that was started for it.
     pub(crate) fn started(&mut self, child: ChildProcess, number: u32) {
         self.enter(LambdaState::Running(Box::new(LambdaProcess::new(child, number))));
     }
@@ -229,7 +228,6 @@ impl SupervisedLambda {
         matches!(self.state, LambdaState::Running(_))
     }
 
-    /// Returns whether its process has closed a pipe.
     pub(crate) fn has_closed_a_pipe(&mut self) -> bool {
         self.process().is_some_and(|process| process.open_pipes < PIPES)
     }
@@ -262,7 +260,6 @@ impl SupervisedLambda {
         }
     }
 
-    /// Requests the process to end.
     pub(crate) fn terminate(&mut self) {
         if let Some(process) = self.process() {
             process.child.terminate();
@@ -342,7 +339,6 @@ impl SupervisedLambda {
                 && process.last.as_deref().is_some_and(has_handled))
     }
 
-    /// Returns what it is doing.
     pub(crate) fn phase(&self) -> LambdaPhase {
         if self.is_leaving { LambdaPhase::Stopping } else { self.state.phase() }
     }

@@ -19,7 +19,6 @@ use sha2::Digest;
 use crate::keys::{PublicKey, SecretKey};
 use crate::{Refusal, bounded};
 
-/// Maximum number of signatures of an envelope.
 pub(crate) const SIGNATURES_MAX: usize = 16;
 
 /// A type of signed data.
@@ -152,7 +151,6 @@ impl<P: Payload> Unverified<P> {
         Ok(signers)
     }
 
-    /// Returns whether it has exactly one signature.
     pub(crate) fn is_single(&self) -> bool {
         self.signatures.len() == 1
     }
@@ -176,7 +174,6 @@ impl<P: Payload> Unverified<P> {
     }
 }
 
-/// Returns the text of a SHA-256.
 pub(crate) fn digest_text(digest: &[u8]) -> Sha256 {
     hex(digest).parse().expect("hexadecimal digits of 32 bytes")
 }

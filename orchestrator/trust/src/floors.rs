@@ -13,7 +13,7 @@ const NAMES_MAX: usize = 4096;
 /// The furthest that a clock or a signed time can raise the trusted time above its anchor, and a
 /// trust root the anchor, in seconds: a year.
 const STEP: u64 = 366 * 86_400;
-/// Longest text of floors.
+/// Longest text of floors, in bytes.
 const TEXT_MAX: usize = 4 << 20;
 
 /// The newest accepted releases, and the time. The default has accepted nothing.

@@ -11,7 +11,7 @@ use gleaner_lambda::layout::{BUILD_MAX, FILE_MAX, FILES_MAX};
 use gleaner_lambda::manifest::{
     ConfigValue, ItemName, LambdaKind, LambdaName, RelativePath, Sha256, TopicName, Version,
 };
-use serde::{Deserialize, Serialize, Serializer};
+use serde::{Deserialize, Serialize};
 
 use crate::{Payload, PublicKey, bounded};
 
@@ -222,7 +222,7 @@ impl Payload for TrustRoot {
 }
 
 /// The name of a lambda, or the start of names and `*`.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct LambdaPattern(String);
 
 impl LambdaPattern {
@@ -252,12 +252,6 @@ impl FromStr for LambdaPattern {
 impl fmt::Display for LambdaPattern {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(&self.0)
-    }
-}
-
-impl Serialize for LambdaPattern {
-    fn serialize<S: Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
-        to.serialize_str(&self.0)
     }
 }
 

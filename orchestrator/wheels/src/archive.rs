@@ -31,7 +31,6 @@ const RECORD_MAX: u64 = 16 << 20;
 /// The files beside RECORD that it need not list: signatures, which nothing checks.
 const UNLISTED: [&str; 3] = ["RECORD", "RECORD.jws", "RECORD.p7s"];
 
-/// Length and digest of a file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct FileDigest {
     pub(crate) bytes: u64,
@@ -61,10 +60,45 @@ pub(crate) struct WheelArchive {
 /// [`WheelError`] with the first entry that is refused.
 pub fn check(path: &Path) -> Result<WheelName, WheelError> {
     let mut wheel = WheelArchive::open(path)?;
+    merged([(wheel.name.as_str(), &*wheel.files)])?;
     for number in 0..wheel.files.len() {
         wheel.copy(number, &mut io::sink())?;
     }
     Ok(wheel.name)
+}
+
+/// Returns the files of wheels by their paths in the folder of packages, each with its digest and
+/// the number of the last wheel that has it. The wheels are given with their names.
+///
+/// # Errors
+///
+/// [`WheelError`]: different files of one name, or a file and a folder.
+pub(crate) fn merged<'w>(
+    wheels: impl IntoIterator<Item = (&'w str, &'w [WheelFile])>,
+) -> Result<BTreeMap<&'w Path, (FileDigest, usize)>, WheelError> {
+    let (mut files, mut names) = (BTreeMap::new(), Vec::new());
+    let wheel = |names: &[&str], number: usize| names[number].to_owned();
+    for (number, (name, of_wheel)) in wheels.into_iter().enumerate() {
+        names.push(name);
+        for file in of_wheel {
+            let before = files.insert(&*file.path, (file.digest, number));
+            // Packages of one namespace may have the same `__init__.py`.
+            if let Some((_, first)) = before.filter(|(other, _)| *other != file.digest) {
+                let (first, second) = (wheel(&names, first), wheel(&names, number));
+                let entry = file.path.to_string_lossy().into_owned();
+                return Err(WheelError::Conflict { first, second, entry });
+            }
+        }
+    }
+    // What is in a folder follows a file of its name.
+    for ((file, (_, first)), (path, (_, second))) in files.iter().zip(files.iter().skip(1)) {
+        if path.starts_with(file) {
+            let (first, second) = (wheel(&names, *first), wheel(&names, *second));
+            let entry = file.to_string_lossy().into_owned();
+            return Err(WheelError::FileAndFolder { first, second, entry });
+        }
+    }
+    Ok(files)
 }
 
 impl WheelArchive {
@@ -83,7 +117,7 @@ impl WheelArchive {
 
     /// Returns the paths and lengths of its files, by their numbers in the archive.
     fn entries(&mut self) -> Result<BTreeMap<usize, (String, u64)>, WheelError> {
-        let mut entries = BTreeMap::new();
+        let (mut entries, mut folders) = (BTreeMap::new(), BTreeSet::new());
         let mut left = UNPACKED_MAX.bytes();
         if self.archive.len() > FILES_MAX {
             return Err(self.too_much());
@@ -96,6 +130,9 @@ impl WheelArchive {
             if path.parse::<RelativePath>().is_err() {
                 return refused("a path has to lead into the folder of packages");
             }
+            if gleaner_base::visible(path) != path {
+                return refused("a path has to be text that a terminal shows as it is");
+            }
             if entry.is_symlink() {
                 return refused("links are not unpacked");
             }
@@ -103,12 +140,16 @@ impl WheelArchive {
                 return refused("it is encrypted");
             }
             if entry.is_dir() {
+                folders.insert(path.to_owned());
                 continue;
             }
             let bytes = entry.size();
             drop(entry);
             left = left.checked_sub(bytes).ok_or_else(|| self.too_much())?;
             entries.insert(index, (text, bytes));
+        }
+        if let Some((text, _)) = entries.values().find(|(text, _)| folders.contains(text)) {
+            return Err(self.name.refused(text, "a folder of the same name"));
         }
         Ok(entries)
     }
@@ -151,6 +192,9 @@ impl WheelArchive {
             };
             files.push(WheelFile { index, path: path.into(), digest });
         }
+        // One that is at the top and in Python's folder is unpacked once.
+        files.sort_by(|a, b| a.path.cmp(&b.path));
+        files.dedup_by(|a, b| (&a.path, a.digest) == (&b.path, b.digest));
         Ok(files)
     }
 
@@ -181,7 +225,11 @@ impl WheelArchive {
                 let path = gleaner_base::excerpt(path);
                 self.name.no_record(&format!("the line of `{path}` has no SHA-256 and length"))
             })?;
-            listed.insert(path.to_owned(), parsed);
+            // The archive has two entries of the name then, of which the reader skips one.
+            if listed.insert(path.to_owned(), parsed).is_some_and(|other| other != parsed) {
+                let path = gleaner_base::excerpt(path);
+                return Err(self.name.no_record(&format!("it lists `{path}` twice")));
+            }
         }
         Ok(listed)
     }
@@ -294,6 +342,9 @@ mod tests {
             (plain().file("/etc/x.py", ""), "the entry `/etc/x.py`"),
             (plain().file("plain\\x.py", ""), "the entry `plain\\x.py`"),
             (plain().file("plain-1.0.data/purelib/../../x", ""), "has to lead into"),
+            (plain().file("plain/\u{202e}x.py", ""), r"the entry `plain/\u{202e}x.py`"),
+            (plain().file("odd", "").file("odd/x.py", ""), "has a file and a folder `odd`"),
+            (plain().file("odd", "").unlisted("odd/", ""), "the entry `odd`, and a folder"),
             (plain().link("plain/key", "/etc/passwd"), "links are not unpacked"),
             (plain().unlisted("plain/more.py", ""), "it does not list `plain/more.py`"),
             (
@@ -323,29 +374,28 @@ mod tests {
         }
     }
 
+    /// Changes the length in both headers of each entry that has it; returns the archive.
+    fn state_length(path: &Path, length: u32, stated: u32) -> Vec<u8> {
+        let mut bytes = std::fs::read(path).unwrap();
+        for at in 0..bytes.len() - 4 {
+            if bytes[at..at + 4] == length.to_le_bytes() {
+                bytes[at..at + 4].copy_from_slice(&stated.to_le_bytes());
+            }
+        }
+        std::fs::write(path, &bytes).unwrap();
+        bytes
+    }
+
     #[test]
     fn an_archive_that_is_longer_than_it_states_is_refused() {
         let folder = tempfile::tempdir().unwrap();
-        let path = plain().file("plain/zeros", vec![0; 1 << 20]).write(folder.path());
-        let mut bytes = std::fs::read(&path).unwrap();
-        let length = u32::to_le_bytes(1 << 20);
-        // Both headers of the entry state ten bytes now.
-        for at in 0..bytes.len() - 4 {
-            if bytes[at..at + 4] == length {
-                bytes[at..at + 4].copy_from_slice(&u32::to_le_bytes(10));
-            }
-        }
-        std::fs::write(&path, &bytes).unwrap();
+        let wheel = plain().file("plain/zeros", vec![0; 1 << 20]);
+        let path = wheel.write(folder.path());
+        state_length(&path, 1 << 20, 10);
         check(&path).unwrap_err();
         // A bomb states its length: it is refused before it is unpacked.
-        let path = plain().file("plain/zeros", vec![0; 1 << 20]).write(folder.path());
-        let mut bytes = std::fs::read(&path).unwrap();
-        for at in 0..bytes.len() - 4 {
-            if bytes[at..at + 4] == length {
-                bytes[at..at + 4].copy_from_slice(&u32::to_le_bytes(u32::MAX - 1));
-            }
-        }
-        std::fs::write(&path, &bytes).unwrap();
+        wheel.write(folder.path());
+        let bytes = state_length(&path, 1 << 20, u32::MAX - 1);
         check(&path).unwrap_err();
         std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
         let text = check(&path).unwrap_err().to_string();
@@ -360,13 +410,7 @@ mod tests {
             wheel = wheel.file(&format!("plain/zeros{number}"), vec![0; 1 << 10]);
         }
         let path = wheel.write(folder.path());
-        let mut bytes = std::fs::read(&path).unwrap();
-        for at in 0..bytes.len() - 4 {
-            if bytes[at..at + 4] == u32::to_le_bytes(1 << 10) {
-                bytes[at..at + 4].copy_from_slice(&u32::to_le_bytes(1 << 30));
-            }
-        }
-        std::fs::write(&path, &bytes).unwrap();
+        state_length(&path, 1 << 10, 1 << 30);
         let error = WheelArchive::open(&path).unwrap_err();
         assert!(matches!(error, WheelError::TooMuch { .. }), "{error}");
     }

@@ -16,8 +16,8 @@ use gleaner_lambda::layout::FILE_MAX;
 use gleaner_parts::Parts;
 use sha2::{Digest, Sha256};
 
-use crate::archive::{FILES_MAX, FileDigest, UNPACKED_MAX, WheelArchive, WheelFile};
-use crate::{Interpreter, WheelError, wheels_of};
+use crate::archive::{FILES_MAX, FileDigest, UNPACKED_MAX, WheelArchive, WheelFile, merged};
+use crate::{Interpreter, WheelError, WheelName, wheels_of};
 
 /// Name of the environment in the folder of a revision.
 pub const ENVIRONMENT: &str = "environment";
@@ -91,39 +91,22 @@ impl WantedFiles {
     fn of(interpreter: &Interpreter, paths: &[PathBuf]) -> Result<Self, WheelError> {
         let packages = interpreter.packages();
         let (mut wheels, mut names) = (Vec::new(), Vec::new());
-        let mut files = BTreeMap::new();
-        let mut bytes = 0;
-        for (number, path) in paths.iter().enumerate() {
+        let (mut count, mut bytes) = (0, 0);
+        for path in paths {
             let wheel = WheelArchive::open(path)?;
             wheel.name.check_fits(interpreter)?;
-            names.push(wheel.name.as_str().to_owned());
-            for file in &wheel.files {
-                let (path, digest) = (packages.join(&file.path), file.digest);
-                bytes += digest.bytes;
-                let before = files.insert(path, (digest, number));
-                // Packages of one namespace may have the same `__init__.py`.
-                if let Some((_, first)) = before.filter(|(other, _)| *other != digest) {
-                    let (first, second) = (names[first].clone(), names[number].clone());
-                    let entry = file.path.to_string_lossy().into_owned();
-                    return Err(WheelError::Conflict { first, second, entry });
-                }
-            }
-            if files.len() > FILES_MAX || bytes > UNPACKED_MAX.bytes() {
+            count += wheel.files.len();
+            bytes += wheel.files.iter().map(|file| file.digest.bytes).sum::<u64>();
+            if count > FILES_MAX || bytes > UNPACKED_MAX.bytes() {
                 return Err(wheel.too_much());
             }
+            names.push(wheel.name);
             wheels.push((path.clone(), wheel.files));
         }
-        for (path, (_, second)) in &files {
-            let above = path.ancestors().skip(1);
-            if let Some((folder, (_, first))) =
-                above.filter_map(|folder| files.get_key_value(folder)).next()
-            {
-                let (first, second) = (names[*first].clone(), names[*second].clone());
-                let entry = folder.strip_prefix(&packages).unwrap_or(folder);
-                let entry = entry.to_string_lossy().into_owned();
-                return Err(WheelError::FileAndFolder { first, second, entry });
-            }
-        }
+        let files = wheels.iter().map(|(_, files)| &**files);
+        let files = merged(names.iter().map(WheelName::as_str).zip(files))?;
+        let files = files.into_iter().map(|(path, file)| (packages.join(path), file));
+        let files: BTreeMap<_, _> = files.collect();
         let (major, minor) = interpreter.version;
         let home = interpreter.program.parent().unwrap_or(Path::new("/")).display();
         let config = format!(
@@ -466,7 +449,10 @@ mod tests {
     #[test]
     fn wheels_with_different_files_of_one_name_are_refused() {
         let made = Made::new();
-        let same = MadeWheel::new("third").file("first/__init__.py", "NAME = 'first'\n");
+        let init = "NAME = 'first'\n";
+        let same = MadeWheel::new("third").file("first/__init__.py", init);
+        // Also twice in one wheel.
+        let same = same.file("third-1.0.data/purelib/first/__init__.py", init);
         let same = same.write(made.folder.path());
         let all = [&made.wheels[..], &[same]].concat();
         prepare_for(&made.interpreter, &all, made.folder.path()).unwrap();

@@ -10,7 +10,6 @@ use sha2::{Digest, Sha256};
 use zip::ZipWriter;
 use zip::write::SimpleFileOptions;
 
-/// A wheel to write.
 #[derive(Clone)]
 pub(crate) struct MadeWheel {
     name: String,
@@ -66,7 +65,6 @@ impl MadeWheel {
         self
     }
 
-    /// Writes it into `folder`; returns its path.
     pub(crate) fn write(&self, folder: &Path) -> PathBuf {
         let path = folder.join(&self.name);
         let mut zip = ZipWriter::new(File::create(&path).unwrap());

@@ -23,7 +23,6 @@ const GAP_NS: i64 = 10_000_000;
 /// Size from which on messages are put into pooled buffers.
 const LARGE: usize = 256 << 10;
 
-/// Error of reading a drive.
 #[derive(Debug, thiserror::Error)]
 #[error(transparent)]
 struct DriveError(ReplayError);

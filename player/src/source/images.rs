@@ -10,7 +10,6 @@ use crate::args::Size;
 use crate::buffer::{Buffer, Pool};
 use crate::cdr;
 
-/// Error of a conversion.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum ConvertError {
     /// The message is not a `CompressedImage`.

@@ -38,7 +38,6 @@ pub(crate) trait MessageSource: Send {
     fn undecodable(&self, topic: usize) -> u64;
 }
 
-/// Opens the source that the arguments request.
 pub(crate) fn open(args: &Args) -> Result<Box<dyn MessageSource>, Failure> {
     if args.drives.is_empty() {
         return Ok(Box::new(synthetic::Synthetic::open(args)?));

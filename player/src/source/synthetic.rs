@@ -17,7 +17,6 @@ use crate::queue::QueuedMessage;
 const IMAGES: &str = "/camera/synthetic/image_raw";
 const IMU: &str = "/imu/synthetic";
 
-/// Seed of the noise.
 const SEED: u64 = 0x676c_6561_6e65_7221;
 
 /// The sensors, merged by time.
@@ -28,7 +27,6 @@ pub(crate) struct Synthetic {
     pool: Pool,
 }
 
-/// One sensor.
 struct SyntheticSensor {
     /// Size of its frames; `None` for the IMU.
     size: Option<Size>,

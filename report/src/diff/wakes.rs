@@ -11,7 +11,6 @@ pub(super) const WAKES_PER_INSTANT: usize = 65_536;
 /// Maximum number of bytes of their lines, if there are several.
 pub(super) const BYTES_PER_INSTANT: usize = 32 << 20;
 
-/// Errors of [`Pairs`].
 #[derive(Debug)]
 pub(super) enum WakesError {
     Read(ResultsError),
@@ -31,7 +30,6 @@ pub(super) struct Pair {
     pub(super) out_of_order: bool,
 }
 
-/// Iterates over the pairs.
 pub(super) struct Pairs<'a, A, B> {
     a: WakeStream<'a, A>,
     b: WakeStream<'a, B>,

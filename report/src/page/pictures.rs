@@ -19,7 +19,6 @@ const ALL_BYTES: usize = 2 << 20;
 
 const THUMBNAILS_MAX: usize = 200;
 
-/// The collected pictures.
 pub(super) struct Pictures<'a> {
     out: &'a Path,
     start_ns: i64,

@@ -65,7 +65,7 @@ impl MessageType {
         }
     }
 
-    /// PeerMessage `n`, from 1.
+    /// Message `n`, from 1.
     pub fn message(self, n: u32) -> PeerMessage {
         use WireValue::{Bytes, F64, Text, U8, U32};
         let time = |n: u32| [U32(1000 + n), U32(7 * n + 3)];

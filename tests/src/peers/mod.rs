@@ -78,11 +78,8 @@ pub struct PeerNode {
 impl PeerKind {
     /// The reason why it cannot be started; `None` if it can.
     pub fn unavailable(self) -> Option<&'static str> {
-        if self.files().iter().all(|file| file.is_file()) {
-            None
-        } else {
-            Some("no peers; run: cargo xtask peers")
-        }
+        let is_built = self.files().iter().all(|file| file.is_file());
+        (!is_built).then_some("no peers; run: cargo xtask peers")
     }
 
     fn files(self) -> Vec<PathBuf> {

@@ -14,6 +14,8 @@ use gleaner_tests::markdown::{anchors, blocks, links};
 use gleaner_tests::tree::{File, files};
 use gleaner_tests::{program, root};
 
+use super::none;
+
 /// Pages whose Rust code is all quoted from files. Other pages show fragments of their own.
 const EXCERPTS_ONLY: [&str; 4] =
     ["docs/first-rust.md", "docs/data.md", "docs/cookbook.md", "docs/errors.md"];
@@ -23,12 +25,6 @@ fn pages() -> Vec<File> {
         .into_iter()
         .filter(|file| file.is_one_of(&["md"]) && !file.path.starts_with("cli/src/new/"))
         .collect()
-}
-
-/// Fails with each problem on its own line.
-#[track_caller]
-fn none(problems: Vec<String>) {
-    assert!(problems.is_empty(), "\n{}", problems.join("\n"));
 }
 
 #[test]

@@ -7,3 +7,9 @@ mod rooms;
 mod standing_alone;
 mod wit;
 mod words;
+
+/// Fails with each problem on its own line.
+#[track_caller]
+fn none(problems: Vec<String>) {
+    assert!(problems.is_empty(), "\n{}", problems.join("\n"));
+}

@@ -10,6 +10,8 @@ use gleaner_tests::rooms::{
 };
 use gleaner_tests::tree::{File, files};
 
+use super::none;
+
 /// A longer file is split: it should be readable without opening five others, and in one sitting.
 const LINES_MAX: usize = 500;
 
@@ -23,12 +25,6 @@ fn toml_of(path: &str) -> toml::Table {
         .find(|file| file.path == path)
         .unwrap_or_else(|| panic!("there is no `{path}`"));
     file.text.parse().unwrap_or_else(|error| panic!("`{path}` is no TOML: {error}"))
-}
-
-/// Fails with every problem on a line of its own.
-#[track_caller]
-fn none(problems: Vec<String>) {
-    assert!(problems.is_empty(), "\n{}", problems.join("\n"));
 }
 
 #[test]

@@ -48,7 +48,6 @@ impl Orin {
         check
     }
 
-    /// Builds the engine; returns the output.
     fn build(&self, gpu: &str) -> Output {
         self.command(gpu, &["--build-engines"]).output().expect("gleaner starts")
     }
@@ -147,7 +146,6 @@ fn a_damaged_engine_and_one_that_others_could_have_written_are_not_used() {
     assert!(orin.check("Orin").contains("its engine was built ahead"));
 }
 
-/// Returns the entry with the engine of another model.
 fn entry_of_another_model() -> Vec<u8> {
     let folder = TempFolder::new();
     BuiltEngine::put(folder.path(), &"0".repeat(64), "Orin", b"engine of the fake GPU").unwrap();

@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use gleaner_tests::readers::compare_clips;
 use gleaner_tests::{
     LambdaCopy, ReplayRun, TempFolder, Verification, replay_to, root, sample_drive, verify,
+    verify_clip,
 };
 
 const HELLO: &str = "examples/hello/rust";
@@ -27,16 +28,17 @@ fn journaled(lambda: &Path, drive: &Path, args: &[&str]) -> JournaledRun {
     JournaledRun { out, journal, run }
 }
 
-fn verify_drive(lambda: &Path, drive: &Path, journal: &Path, args: &[&str]) -> Verification {
+pub(super) fn verify_drive(
+    lambda: &Path,
+    drive: &Path,
+    journal: &Path,
+    args: &[&str],
+) -> Verification {
     let mut line: Vec<&OsStr> =
         vec!["replay".as_ref(), lambda.as_ref(), drive.as_ref(), "--verify".as_ref()];
     line.push(journal.as_ref());
     line.extend(args.iter().map(OsStr::new));
     verify(&line)
-}
-
-fn verify_clip(lambda: &Path, clip: &Path) -> Verification {
-    verify(&["verify".as_ref(), clip.as_ref(), "--lambda".as_ref(), lambda.as_ref()])
 }
 
 #[track_caller]
@@ -296,7 +298,7 @@ fn a_clip_verifies_its_decisions_and_counts_those_it_cannot() {
             compare_clips(journaled.out.path(), &[sample_drive()]);
             assert!(!journaled.run.clips.is_empty());
             for clip in &journaled.run.clips {
-                let again = verify_clip(&lambda, &journaled.out.path().join(&clip.file));
+                let again = verify_clip(&journaled.out.path().join(&clip.file), &lambda);
                 let verified = again
                     .verified
                     .unwrap_or_else(|| panic!("{example} in {kind}: {}", again.stderr));
@@ -321,7 +323,7 @@ fn a_clip_without_a_topic_that_the_lambda_reads_cannot_be_verified() {
     });
     let journaled = journaled(lambda.path(), &sample_drive(), &BRAKING);
     let clip = journaled.out.path().join(&journaled.run.clips[0].file);
-    differs(&verify_clip(lambda.path(), &clip), 2, &["/imu/data", "[record]", "--verify"]);
+    differs(&verify_clip(&clip, lambda.path()), 2, &["/imu/data", "[record]", "--verify"]);
 }
 
 #[test]
@@ -332,7 +334,7 @@ fn a_clip_that_covers_no_trigger_cannot_be_verified() {
     });
     let journaled = journaled(lambda.path(), &sample_drive(), &BRAKING);
     let clip = journaled.out.path().join(&journaled.run.clips[2].file);
-    differs(&verify_clip(lambda.path(), &clip), 2, &["proves no trigger", "preroll", "--verify"]);
+    differs(&verify_clip(&clip, lambda.path()), 2, &["proves no trigger", "preroll", "--verify"]);
 }
 
 #[test]
@@ -347,7 +349,7 @@ fn a_clip_of_a_lambda_over_its_log_rate_limit_can_be_verified() {
         journaled(lambda.path(), &sample_drive(), &["--set", "behaviour=event_then_error"]);
     assert!(journaled.run.clips.len() >= 2);
     let clip = journaled.out.path().join(&journaled.run.clips[1].file);
-    let again = verify_clip(lambda.path(), &clip);
+    let again = verify_clip(&clip, lambda.path());
     let verified = again.verified.unwrap_or_else(|| panic!("{}", again.stderr));
     assert!(verified.triggers > verified.uncovered_triggers, "{verified:?}");
 }
@@ -361,7 +363,7 @@ fn a_changed_clip_is_found() {
         let mut bytes = complete.clone();
         bytes[at] ^= 0x20;
         let changed = journaled.out.write("changed.mcap", &bytes);
-        let again = verify_clip(&root().join(HELLO), &changed);
+        let again = verify_clip(&changed, &root().join(HELLO));
         assert!(
             [2, 4, 7].contains(&again.exit),
             "flip at {at}: exit {} {}",
@@ -375,10 +377,10 @@ fn a_changed_clip_is_found() {
 fn a_clip_without_a_journal_of_the_lambda_is_refused() {
     let journaled = journaled(&root().join(HELLO), &sample_drive(), &BRAKING);
     let clip = journaled.out.path().join(&journaled.run.clips[0].file);
-    let again = verify_clip(&root().join("examples/brake-dark/rust"), &clip);
+    let again = verify_clip(&clip, &root().join("examples/brake-dark/rust"));
     differs(&again, 2, &["no journal of lambda `brake-dark`", "hello"]);
     differs(
-        &verify_clip(&root().join(HELLO), &sample_drive()),
+        &verify_clip(&sample_drive(), &root().join(HELLO)),
         2,
         &["no journal of lambda `hello`"],
     );

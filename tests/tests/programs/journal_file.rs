@@ -1,15 +1,12 @@
 //! The file of `--journal`: only one replay writes it at a time, equal replays write equal bytes,
 //! and a kill keeps the decisions.
 
-use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Stdio};
 
 use gleaner_journal::{JournalReader, JournalWriter};
 use gleaner_lambda::{Clip, Decision};
-use gleaner_tests::{
-    LambdaCopy, TempFolder, Verification, replay_to, root, runtime, sample_drive, verify,
-};
+use gleaner_tests::{LambdaCopy, TempFolder, Verification, replay_to, root, runtime, sample_drive};
 
 const HELLO: &str = "examples/hello/rust";
 const BRAKING: [&str; 2] = ["--set", "brake_mps2=-1.4"];
@@ -21,12 +18,7 @@ fn journaled(out: &TempFolder, journal: &Path, args: &[&str]) -> gleaner_tests::
 }
 
 fn verify_drive(lambda: &Path, journal: &Path, args: &[&str]) -> Verification {
-    let drive = sample_drive();
-    let mut line: Vec<&OsStr> =
-        vec!["replay".as_ref(), lambda.as_ref(), drive.as_ref(), "--verify".as_ref()];
-    line.push(journal.as_ref());
-    line.extend(args.iter().map(OsStr::new));
-    verify(&line)
+    super::journal::verify_drive(lambda, &sample_drive(), journal, args)
 }
 
 fn hello() -> PathBuf {

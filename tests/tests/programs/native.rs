@@ -1,6 +1,6 @@
 //! Compares a lambda run natively, in the fake host of the SDK, with its component in the host:
 //! every decision is equal, to the last bit of its scores, and so are the log and the counts.
-//! HostComparison use the rules of `gleaner-rules`; these tests cover the code around them.
+//! Both use the rules of `gleaner-rules`; these tests cover the code around them.
 
 use std::path::{Path, PathBuf};
 

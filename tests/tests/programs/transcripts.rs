@@ -11,7 +11,6 @@ use gleaner_tests::drive::{corrupted, truncated};
 use gleaner_tests::transcript::{fits, perform, rewritten, steps};
 use gleaner_tests::{TempFolder, copy_lambda, root, sample_drive};
 
-/// Repeats the transcripts of a page.
 #[track_caller]
 fn assert_transcripts(page: &str, folder: &TempFolder) {
     let path = root().join(page);

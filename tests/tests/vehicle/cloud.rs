@@ -195,3 +195,43 @@ pub fn refused() {
     vehicle.succeeds(&["unenrol"]);
     assert_eq!(vehicle.status().cloud, None);
 }
+
+pub fn restored() {
+    let (mut cloud, mut vehicle) = enrolled();
+    let deploys = |cloud: &TestCloud, vehicle: &TestVehicle, name: &str| {
+        let lambda = ticker("rust", name);
+        let deployed = deploy((cloud, vehicle), &lambda, "deployer", &[]);
+        assert!(deployed.status.success(), "{}", text(&deployed));
+    };
+    deploys(&cloud, &vehicle, "older");
+    cloud.back_up("backup");
+    deploys(&cloud, &vehicle, "newer");
+    cloud.kill();
+    std::fs::remove_dir_all(cloud.path("data")).expect("it is gone");
+    std::fs::rename(cloud.path("backup"), cloud.path("data")).expect("it is restored");
+    assert!(cloud.start().is_none(), "its user is still logged in");
+    vehicle.until("the connection", |_| cloud.vehicle(NAME).is_ahead.then_some(()));
+    // Neither what it does not know nor a stop by it takes anything away before.
+    let stop = cloud.gleaner(&["stop", "older", "--fleet", "--yes", "--timeout", "5s"]);
+    assert!(text(&stop).contains("car-7: it stays here"), "{}", text(&stop));
+    vehicle.until("what stays, by name", |_| {
+        cloud.succeeds(&["vehicles"]).contains("newer: it stays here").then_some(())
+    });
+    for id in ["older", "newer"] {
+        assert_eq!(phase(&vehicle, id), Some(LambdaPhase::Running));
+    }
+    cloud.succeeds(&["vehicles", "agree", NAME]);
+    vehicle.until("the removal and the stop", |vehicle| {
+        let left: Vec<_> = vehicle.status().deployments;
+        (left.len() == 1 && left[0].id == "older" && !left[0].is_wanted).then_some(())
+    });
+    vehicle.until("no difference", |_| (!cloud.vehicle(NAME).is_ahead).then_some(()));
+    until_all_events(&cloud, &vehicle);
+    // An image of this vehicle begins with another key, and without an enrolment.
+    let key = vehicle.status().key;
+    vehicle.succeeds(&["unenrol", "--new-identity"]);
+    vehicle.kill_orchestrator();
+    vehicle.start();
+    let status = vehicle.status();
+    assert!(status.key != key && status.cloud.is_none(), "{status:?}");
+}

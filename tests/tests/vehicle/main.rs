@@ -21,7 +21,7 @@ use libtest_mimic::{Arguments, Trial};
 
 type Case = (&'static str, fn());
 
-const CASES: [Case; 28] = [
+const CASES: [Case; 29] = [
     ("lambdas_outlive_the_orchestrator", deployments::outlive),
     ("a_supervisor_that_ends_after_sighup_is_no_zombie", deployments::reaped),
     ("after_an_upgrade_old_and_new_programs_do_not_mix", deployments::upgraded),
@@ -49,6 +49,7 @@ const CASES: [Case; 28] = [
     ("a_vehicle_runs_what_the_cloud_wants_and_sends_its_records", cloud::follows),
     ("clips_reach_the_cloud_once_and_are_verified_after_a_pull", cloud::clips),
     ("a_cloud_that_is_killed_loses_nothing", cloud::killed),
+    ("a_restored_cloud_takes_nothing_away_until_a_user_agrees", cloud::restored),
     ("a_vehicle_refuses_what_no_trusted_key_signed_and_runs_without_a_cloud", cloud::refused),
 ];
 
@@ -151,7 +152,6 @@ impl PythonLambda {
     }
 }
 
-/// The texts of the events of a kind.
 fn events(vehicle: &TestVehicle, kind: EventKind) -> Vec<String> {
     let events = vehicle.records(None).into_iter().filter(|line| line.kind == "event");
     let events = events

@@ -1,7 +1,6 @@
 //! Defines the replays, and runs them on this machine and on the emulated one.
 
 use std::fs;
-use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::time::Instant;
@@ -12,6 +11,8 @@ use gleaner_protocol::{ReplaySummary, Verified};
 use super::compare::{ReplayResults, read};
 use crate::checkout::Checkout;
 use crate::examples::DRIVE;
+use crate::private_folder::PrivateFolder;
+use crate::steps;
 
 /// Result folder in the checkout.
 pub(super) const OUT: &str = "out/aarch64";
@@ -104,11 +105,8 @@ impl<'c> Machine<'c> {
     fn run(&self, mut command: Command) -> Result<Output, Failure> {
         command.output().map_err(|error| {
             let program = command.get_program().display();
-            Failure::caused_by(
-                Exit::Internal,
-                format!("cannot start `{program}` for {}", self.name),
-                &error,
-            )
+            let message = format!("cannot start `{program}` for {}", self.name);
+            Failure::caused_by(Exit::Internal, message, &error)
         })
     }
 
@@ -117,10 +115,8 @@ impl<'c> Machine<'c> {
         let output = self.run(command)?;
         serde_json::from_slice(&output.stdout).map_err(|_| {
             let stderr = String::from_utf8_lossy(&output.stderr).trim().to_owned();
-            let mut failure = Failure::new(
-                Exit::Internal,
-                format!("no result on {} ({})", self.name, output.status),
-            );
+            let message = format!("no result on {} ({})", self.name, output.status);
+            let mut failure = Failure::new(Exit::Internal, message);
             failure.causes =
                 vec![if stderr.is_empty() { "it printed no error".to_owned() } else { stderr }];
             failure
@@ -143,15 +139,11 @@ impl ReplayCase {
             return Ok(PathBuf::from(self.lambda));
         }
         let copy = Path::new(OUT).join("deterministic");
-        copy_deterministic(&checkout.path(self.lambda), &checkout.path(&copy)).map_err(
-            |error| {
-                Failure::caused_by(
-                    Exit::Internal,
-                    format!("cannot copy `{}` to `{}`", self.lambda, copy.display()),
-                    &error,
-                )
-            },
-        )?;
+        let copied = copy_deterministic(&checkout.path(self.lambda), &checkout.path(&copy));
+        copied.map_err(|error| {
+            let message = format!("cannot copy `{}` to `{}`", self.lambda, copy.display());
+            Failure::caused_by(Exit::Internal, message, &error)
+        })?;
         Ok(copy)
     }
 
@@ -166,23 +158,17 @@ impl ReplayCase {
     pub(super) fn replay(&self, machine: &Machine<'_>) -> Result<ReplayResults, Failure> {
         let out = self.out(machine);
         let folder = machine.checkout.path(&out);
-        let failed = |error: std::io::Error| {
-            Failure::caused_by(Exit::Internal, format!("cannot make `{}`", out.display()), &error)
-        };
-        fs::create_dir_all(&folder).map_err(failed)?;
+        steps::make_folder(&folder)?;
         let mut replay = machine.program("gleaner");
-        replay
-            .arg("replay")
-            .arg(self.lambda(machine.checkout)?)
-            .arg(DRIVE)
-            .args(["--all", "--json", "--out"])
-            .arg(&out);
+        replay.arg("replay").arg(self.lambda(machine.checkout)?).args([DRIVE, "--all", "--json"]);
+        replay.arg("--out").arg(&out);
         replay.args(self.set.iter().flat_map(|set| ["--set", set]));
         replay.args(self.to.iter().flat_map(|to| ["--to", to]));
         replay.arg("--journal").arg(journal(&out));
         if let Some(limit) = self.limit {
             let vehicle = folder.join("vehicle.toml");
-            fs::write(&vehicle, format!("[limits]\n{limit}\n")).map_err(failed)?;
+            fs::write(&vehicle, format!("[limits]\n{limit}\n"))
+                .map_err(|error| steps::cannot("write", &vehicle, &error))?;
             replay.arg("--vehicle").arg(vehicle);
         }
         let started = Instant::now();
@@ -210,13 +196,7 @@ impl ReplayCase {
 
 fn copy_deterministic(lambda: &Path, copy: &Path) -> std::io::Result<()> {
     let build = copy.join("build");
-    fs::create_dir_all(&build)?;
-    for entry in fs::read_dir(lambda.join("build"))? {
-        let file = entry?;
-        if file.path().is_file() {
-            fs::copy(file.path(), build.join(file.file_name()))?;
-        }
-    }
+    steps::copy_files(&lambda.join("build"), &build)?;
     let manifest = fs::read_to_string(lambda.join("build/lambda.toml"))?;
     let manifest = manifest.replace("[lambda]\n", "[lambda]\ndeterministic = true\n");
     // The manifest of the build is written last, since a build must not be older than its source.
@@ -232,74 +212,43 @@ fn journal(out: &Path) -> PathBuf {
 /// again instead of loaded. Returns the warning.
 pub(super) fn foreign_code(here: &Machine<'_>, there: &Machine<'_>) -> Result<String, Failure> {
     let lambda = CASES[0].lambda;
-    let cache = TempCache::make()?;
+    // Loading code requires that only this user may write it.
+    let cache = PrivateFolder::create("aarch64")?;
     let compile = |machine: &Machine<'_>, folder: &str| -> Result<PathBuf, Failure> {
         let mut compile = machine.program("gleaner-compile");
         let component = machine.checkout.path(lambda).join("build/hello.wasm");
-        compile.arg(component).arg("--cache").arg(cache.0.join(folder)).stderr(Stdio::inherit());
+        compile
+            .arg(component)
+            .arg("--cache")
+            .arg(cache.path().join(folder))
+            .stderr(Stdio::inherit());
         let output = machine.run(compile)?;
         let entry = String::from_utf8_lossy(&output.stdout).trim().to_owned();
         if output.status.success() {
             Ok(PathBuf::from(entry))
         } else {
-            Err(Failure::new(
-                Exit::Internal,
-                format!("cannot compile for {} ({})", machine.name, output.status),
-            ))
+            let message = format!("cannot compile for {} ({})", machine.name, output.status);
+            Err(Failure::new(Exit::Internal, message))
         }
     };
     // A program uses the folder `gleaner` in `XDG_CACHE_HOME`.
     let (foreign, own) = (compile(here, "here")?, compile(there, "gleaner")?);
     if foreign.file_name() == own.file_name() {
-        return Err(Failure::new(
-            Exit::Differs,
-            "code of both processors has the same name in the cache",
-        ));
+        let message = "code of both processors has the same name in the cache";
+        return Err(Failure::new(Exit::Differs, message));
     }
     fs::copy(&foreign, &own)
         .map_err(|error| Failure::caused_by(Exit::Internal, "cannot copy code", &error))?;
     let mut replay = there.program("gleaner");
-    replay
-        .env("XDG_CACHE_HOME", &cache.0)
-        .arg("replay")
-        .arg(lambda)
-        .arg(DRIVE)
-        .arg("--out")
-        .arg(cache.0.join("out"));
+    replay.args(["replay", lambda, DRIVE, "--out"]).arg(cache.path().join("out"));
+    replay.env("XDG_CACHE_HOME", cache.path());
     let output = there.run(replay)?;
     let stderr = String::from_utf8_lossy(&output.stderr).trim().to_owned();
     if !output.status.success() || !stderr.contains("native code in the cache is damaged") {
-        let mut failure = Failure::new(
-            Exit::Differs,
-            format!("code of {} was not replaced on {}", here.name, there.name),
-        );
+        let message = format!("code of {} was not replaced on {}", here.name, there.name);
+        let mut failure = Failure::new(Exit::Differs, message);
         failure.causes = vec![format!("it ended with {}: {stderr}", output.status)];
         return Err(failure);
     }
     Ok(stderr)
-}
-
-/// A cache in a folder that only this user may write, as loading code requires. It is removed in
-/// the end.
-struct TempCache(PathBuf);
-
-impl TempCache {
-    fn make() -> Result<TempCache, Failure> {
-        let folder = std::env::temp_dir().join(format!("gleaner-aarch64-{}", std::process::id()));
-        fs::DirBuilder::new().mode(0o700).create(&folder).map_err(|error| {
-            Failure::caused_by(
-                Exit::Internal,
-                format!("cannot make `{}`", folder.display()),
-                &error,
-            )
-        })?;
-        Ok(TempCache(folder))
-    }
-}
-
-impl Drop for TempCache {
-    fn drop(&mut self) {
-        // Remains in a temporary folder do no harm.
-        let _ = fs::remove_dir_all(&self.0);
-    }
 }

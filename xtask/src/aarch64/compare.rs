@@ -8,6 +8,8 @@ use std::path::{Path, PathBuf};
 use gleaner_base::{Exit, Failure};
 use serde_json::{Map, Value};
 
+use crate::steps::cannot;
+
 /// The results of a replay, and its duration, which is not compared.
 pub(super) struct ReplayResults {
     /// One decision for each wake, without its run time.
@@ -20,22 +22,19 @@ pub(super) struct ReplayResults {
 
 /// Reads the results in `folder` of a replay that had `wakes` wakes and took `seconds`.
 pub(super) fn read(folder: &Path, wakes: u64, seconds: f64) -> Result<ReplayResults, Failure> {
-    let cannot_read = |path: &Path, error: &dyn std::error::Error| {
-        Failure::caused_by(Exit::Internal, format!("cannot read `{}`", path.display()), error)
-    };
     let path = folder.join("decisions.jsonl");
-    let text = fs::read_to_string(&path).map_err(|error| cannot_read(&path, &error))?;
+    let text = fs::read_to_string(&path).map_err(|error| cannot("read", &path, &error))?;
     let decisions = text
         .lines()
         .map(parse_decision)
         .collect::<Result<Vec<_>, _>>()
-        .map_err(|error| cannot_read(&path, &error))?;
+        .map_err(|error| cannot("read", &path, &error))?;
     if decisions.len() as u64 != wakes {
         let message =
             format!("`{}` has {} decisions for {wakes} wakes", path.display(), decisions.len());
         return Err(Failure::new(Exit::Internal, message));
     }
-    let files = other_files(folder).map_err(|error| cannot_read(folder, &error))?;
+    let files = other_files(folder).map_err(|error| cannot("read", folder, &error))?;
     Ok(ReplayResults { decisions, seconds, files })
 }
 

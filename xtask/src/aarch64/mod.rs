@@ -12,7 +12,7 @@ mod compare;
 mod tools;
 
 use std::env;
-use std::fs;
+use std::fs::{self, Permissions};
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -21,7 +21,7 @@ use gleaner_base::{Exit, Failure};
 
 use crate::checkout::Checkout;
 use crate::setup;
-use crate::steps::{self, Steps};
+use crate::steps::{self, Steps, cannot};
 use cases::{CASES, Machine, ReplayCase};
 use tools::Emulator;
 pub(crate) use tools::{TARGET, Tools};
@@ -29,7 +29,6 @@ pub(crate) use tools::{TARGET, Tools};
 const PROGRAMS: [&str; 4] = ["gleaner", "gleaner-compile", "gleaner-inference", "gleaner-runtime"];
 const SHIM: &str = "gleaner-shim";
 
-/// Builds, replays here and there, and compares.
 pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     if env::consts::ARCH == "aarch64" {
         return Err(Failure::new(Exit::Usage, "this machine is itself an aarch64")
@@ -58,18 +57,10 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     Ok(if unexpected == 0 { Exit::Ok } else { Exit::Differs })
 }
 
-/// Builds the programs of packages, and returns their folder.
-pub(crate) fn programs(checkout: &Checkout) -> Result<PathBuf, Failure> {
-    build(&mut Tools::find(checkout)?.cargo(checkout), checkout, &[])
-}
-
-/// As [`programs`], with the packages `others` of cargo, of which one is the player.
-pub(crate) fn programs_with_player(
-    checkout: &Checkout,
-    tools: &Tools,
-    others: &[&str],
-) -> Result<PathBuf, Failure> {
-    build(&mut tools.cargo_with_player(checkout)?, checkout, others)
+/// Builds the programs of packages, and those of the packages `others` of cargo, of which one is
+/// the player; returns their folder.
+pub(crate) fn programs(checkout: &Checkout, others: &[&str]) -> Result<PathBuf, Failure> {
+    build(&mut Tools::find(checkout)?.cargo_with_player(checkout)?, checkout, others)
 }
 
 fn build(cargo: &mut Command, checkout: &Checkout, others: &[&str]) -> Result<PathBuf, Failure> {
@@ -86,22 +77,12 @@ fn scripts(checkout: &Checkout, built: &Path, emulator: &Emulator<'_>) -> Result
     for (name, script) in
         PROGRAMS.map(|name| (name, emulator.script(&built.join(name)))).into_iter().chain([here])
     {
-        write_program(&scripts, name, &script).map_err(|error| {
-            Failure::caused_by(
-                Exit::Internal,
-                format!("cannot write `{}`", scripts.join(name).display()),
-                &error,
-            )
-        })?;
+        let file = scripts.join(name);
+        steps::write_file(&file, &script)?;
+        fs::set_permissions(&file, Permissions::from_mode(0o755))
+            .map_err(|error| cannot("change", &file, &error))?;
     }
     Ok(scripts)
-}
-
-fn write_program(folder: &Path, name: &str, script: &str) -> std::io::Result<()> {
-    fs::create_dir_all(folder)?;
-    let path = folder.join(name);
-    fs::write(&path, script)?;
-    fs::set_permissions(path, fs::Permissions::from_mode(0o755))
 }
 
 /// Compares one case and prints the result. Returns 1 if it is unexpected, else 0.

@@ -23,7 +23,6 @@ const PACKAGES: [&str; 2] = ["g++-aarch64-linux-gnu", "libc6-dev-arm64-cross"];
 const EMULATORS: [&str; 2] = ["qemu-aarch64-static", "qemu-aarch64"];
 const LOADER: &str = "ld-linux-aarch64.so.1";
 
-/// The tools of this machine to build for aarch64.
 pub(crate) struct Tools {
     /// The folder above `include/` and `lib/` of the C library for aarch64.
     libraries: PathBuf,
@@ -87,7 +86,6 @@ pub(super) struct Emulator<'t> {
 }
 
 impl<'t> Emulator<'t> {
-    /// Finds the emulator.
     pub(super) fn find(checkout: &Checkout, tools: &'t Tools) -> Result<Self, Failure> {
         let program = EMULATORS.into_iter().find(|program| has(checkout, program));
         let program = program.ok_or_else(|| missing("no emulator", &["qemu-user-static"]))?;

@@ -10,7 +10,7 @@ use super::tree::{self, PackageTree};
 use crate::architecture::Architecture;
 use crate::checkout::Checkout;
 use crate::glibc::GlibcNeeds;
-use crate::steps::{self, cannot};
+use crate::steps;
 
 /// Scripts that dpkg runs.
 const SCRIPTS: [&str; 3] = ["postinst", "prerm", "postrm"];
@@ -33,7 +33,6 @@ pub(super) struct PackageMetadata {
 }
 
 impl PackagedCommit {
-    /// Returns the commit of the checkout.
     pub(crate) fn of(checkout: &Checkout) -> Self {
         let git = |arguments: &[&str]| answer(checkout.command("git").args(arguments));
         let release = env!("CARGO_PKG_VERSION");
@@ -50,8 +49,19 @@ impl PackagedCommit {
     }
 }
 
+/// Returns the checkout for builds whose programs print the commit: its first 8 digits, followed
+/// by `.dirty` if tracked files differ from it.
+pub(crate) fn with_commit(checkout: &Checkout) -> Checkout {
+    let mut describe = checkout.command("git");
+    describe.args(["describe", "--always", "--exclude=*", "--abbrev=8", "--dirty=.dirty"]);
+    let commit = answer(&mut describe);
+    if commit.is_none() {
+        println!("the programs will print no commit: `git describe` has failed");
+    }
+    checkout.with_commit(commit)
+}
+
 impl PackageMetadata {
-    /// Collects the metadata for the files in `tree`.
     pub(super) fn collect(
         checkout: &Checkout,
         tree: &PackageTree,
@@ -128,11 +138,8 @@ fn libraries(checkout: &Checkout, tree: &PackageTree) -> Result<Option<String>, 
     }
     // It reads `debian/control` of a source package.
     let folder = checkout.target().join("deb/shlibdeps");
-    let control = folder.join("debian/control");
-    let failed = |error: std::io::Error| cannot("write", &control, &error);
-    std::fs::create_dir_all(folder.join("debian")).map_err(failed)?;
-    std::fs::write(&control, "Source: gleaner\n\nPackage: gleaner\nArchitecture: any\n")
-        .map_err(failed)?;
+    let control = "Source: gleaner\n\nPackage: gleaner\nArchitecture: any\n";
+    steps::write_file(&folder.join("debian/control"), control)?;
     let mut find = checkout.command("dpkg-shlibdeps");
     // The extension module's symbols of Python are those of the interpreter that loads it.
     find.current_dir(&folder).args(["-O", "--warnings=0"]);
@@ -167,4 +174,28 @@ fn is_elf(file: &Path) -> bool {
     let mut start = [0; 4];
     let read = std::fs::File::open(file).and_then(|mut file| file.read_exact(&mut start));
     read.is_ok() && start == *b"\x7fELF"
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::test_folder::TestFolder;
+
+    #[test]
+    fn programs_of_packages_get_the_commit_and_whether_files_differ() {
+        let folder = TestFolder::new();
+        let checkout = Checkout::with_cargo(folder.root().to_owned(), "cargo".into());
+        let commit = || {
+            let cargo = with_commit(&checkout).cargo();
+            let mut variables = cargo.get_envs();
+            let found = variables.find(|(name, _)| *name == "GLEANER_COMMIT");
+            found.and_then(|(_, value)| Some(value?.to_str()?.to_owned()))
+        };
+        assert_eq!(commit(), None);
+        folder.write("file", "one");
+        let head = checkout.commit_all()[..8].to_owned();
+        assert_eq!(commit().as_ref(), Some(&head));
+        folder.write("file", "two");
+        assert_eq!(commit(), Some(head + ".dirty"));
+    }
 }

@@ -2,30 +2,15 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use gleaner_base::{Exit, Failure};
-use serde::Deserialize;
+use gleaner_base::Failure;
 
 use super::source::PackageSource;
 use super::tree::PackageTree;
 use crate::checkout::Checkout;
+use crate::metadata::Metadata;
 use crate::steps;
-
-#[derive(Deserialize)]
-struct CargoMetadata {
-    packages: Vec<CratePackage>,
-}
-
-#[derive(Deserialize)]
-struct CratePackage {
-    name: String,
-    version: String,
-    license: Option<String>,
-    /// None for crates of the workspace.
-    source: Option<String>,
-    manifest_path: PathBuf,
-}
 
 /// Writes one file with all crates, and the text of each licence once.
 pub(super) fn write(
@@ -35,10 +20,7 @@ pub(super) fn write(
 ) -> Result<(), Failure> {
     // Both download crates of other platforms, which no build here needed.
     let help = "see the message of cargo above";
-    let mut metadata = checkout.cargo();
-    metadata.args(["metadata", "--format-version=1", "--locked"]);
-    let workspace: CargoMetadata = serde_json::from_str(&steps::output(&mut metadata, help)?)
-        .map_err(|error| Failure::caused_by(Exit::Internal, "cannot parse the crates", &error))?;
+    let metadata = Metadata::read(checkout, "--locked")?;
     let mut linked = checkout.cargo();
     linked.args(["tree", "--locked", "--edges=normal", "--prefix=none"]);
     linked.args(["--format={p}", "--target=all"]);
@@ -53,7 +35,7 @@ pub(super) fn write(
             Some((words.next()?, words.next()?.strip_prefix('v')?))
         })
         .collect();
-    let crates = workspace.packages.iter().filter(|package| {
+    let crates = metadata.packages.iter().filter(|package| {
         package.source.is_some() && linked.contains(&(&*package.name, &*package.version))
     });
     let (mut list, mut texts) = (String::new(), BTreeMap::<String, Vec<String>>::new());
@@ -61,7 +43,7 @@ pub(super) fn write(
         let name = format!("{} {}", package.name, package.version);
         let licence = package.license.as_deref().unwrap_or("see the text below");
         list += &format!("{name}: {licence}\n");
-        for text in texts_of(package.manifest_path.parent().unwrap_or(Path::new("/"))) {
+        for text in texts_of(Path::new(&package.manifest_path).parent().unwrap_or(Path::new("/"))) {
             texts.entry(text).or_default().push(name.clone());
         }
     }
@@ -73,18 +55,37 @@ pub(super) fn write(
     tree.write(&format!("{}/licences", source.doc()), &page).map(drop)
 }
 
-/// The files of a crate with a licence or a notice.
+/// The files of a crate with a licence or a notice, also of sources in C in a folder of it, such as
+/// Cyclone DDS.
 fn texts_of(folder: &Path) -> Vec<String> {
-    let entries = fs::read_dir(folder).into_iter().flatten().filter_map(Result::ok);
-    let mut files: Vec<PathBuf> = entries
-        .filter(|entry| {
-            let name = entry.file_name().to_string_lossy().to_ascii_uppercase();
-            ["LICENSE", "LICENCE", "COPYING", "COPYRIGHT", "NOTICE", "UNLICENSE"]
-                .iter()
-                .any(|start| name.starts_with(start))
-        })
-        .map(|entry| entry.path())
-        .collect();
+    let entries = |folder: &Path| {
+        let entries = fs::read_dir(folder).into_iter().flatten().filter_map(Result::ok);
+        entries.map(|entry| entry.path()).collect::<Vec<_>>()
+    };
+    let mut files = entries(folder);
+    let nested: Vec<_> = files.iter().flat_map(|path| entries(path)).collect();
+    files.extend(nested);
+    files.retain(|file| {
+        let name = file.file_name().unwrap_or_default().to_string_lossy().to_ascii_uppercase();
+        ["LICENSE", "LICENCE", "COPYING", "COPYRIGHT", "NOTICE", "UNLICENSE"]
+            .iter()
+            .any(|start| name.starts_with(start))
+    });
     files.sort();
     files.iter().filter_map(|file| fs::read_to_string(file).ok()).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::test_folder::TestFolder;
+
+    #[test]
+    fn the_licences_of_a_crate_include_those_of_its_sources_in_c() {
+        let folder = TestFolder::new();
+        for file in ["LICENSE-MIT", "cyclonedds/NOTICE.md", "cyclonedds/a.c", "src/lib.rs"] {
+            folder.write(file, file);
+        }
+        assert_eq!(texts_of(folder.root()), ["LICENSE-MIT", "cyclonedds/NOTICE.md"]);
+    }
 }

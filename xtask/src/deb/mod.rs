@@ -8,6 +8,7 @@
 
 mod control;
 mod licences;
+mod options;
 mod root;
 mod source;
 mod tree;
@@ -22,11 +23,12 @@ use gleaner_base::{Exit, Failure};
 use crate::architecture::Architecture;
 use crate::checkout::Checkout;
 use crate::steps::{self, Steps};
-use crate::{aarch64, setup};
+use crate::{aarch64, player, setup};
 use control::PackageMetadata;
-pub(crate) use control::PackagedCommit;
+pub(crate) use control::{PackagedCommit, with_commit};
+pub(crate) use options::PackageOptions;
 use source::PACKAGES;
-pub(crate) use source::{LIB, PackageSource, VEHICLE_PROGRAMS};
+pub(crate) use source::{PLAYER, PackageSource, VEHICLE_PROGRAMS};
 pub(crate) use tree::PackageTree;
 
 const USAGE: &str = "usage: cargo xtask deb [--arch amd64|arm64] [--programs DIR] [--test]
@@ -34,54 +36,16 @@ const USAGE: &str = "usage: cargo xtask deb [--arch amd64|arm64] [--programs DIR
   --programs  folder with the built programs; default: build them
   --test      as root: install, run, upgrade and purge each in a root that debootstrap makes";
 
-#[derive(Debug, PartialEq, Eq)]
-struct DebOptions {
-    architecture: Architecture,
-    programs: Option<PathBuf>,
-    test: bool,
-}
-
-impl DebOptions {
-    fn parse(arguments: &[OsString]) -> Result<Self, Failure> {
-        let mut options =
-            Self { architecture: Architecture::of_this_machine(), programs: None, test: false };
-        let mut arguments = arguments.iter();
-        while let Some(argument) = arguments.next() {
-            match (argument.to_str(), argument == "--test") {
-                (_, true) => options.test = true,
-                (Some("--arch"), _) => {
-                    let name = arguments.next();
-                    let mut all = Architecture::ALL.into_iter();
-                    let known = all.find(|it| name.is_some_and(|is| is == it.name()));
-                    options.architecture = known.ok_or_else(usage)?;
-                }
-                (Some("--programs"), _) => {
-                    options.programs = Some(arguments.next().ok_or_else(usage)?.into());
-                }
-                _ => return Err(usage()),
-            }
-        }
-        if options.test && !options.architecture.is_of_this_machine() {
-            let message = "a package of another architecture cannot be tested on this machine";
-            return Err(Failure::new(Exit::Usage, message));
-        }
-        Ok(options)
-    }
-}
-
-fn usage() -> Failure {
-    Failure::new(Exit::Usage, "`cargo xtask deb` does not take these arguments").with_help(USAGE)
-}
-
 /// Builds the packages, and tests them if that is wanted.
 pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
-    let options = DebOptions::parse(arguments)?;
+    let options = PackageOptions::parse(arguments, USAGE)?;
     let architecture = options.architecture;
+    let checkout = &with_commit(checkout);
     check_tools(checkout, architecture)?;
     let each = if options.test { STEPS + 1 } else { STEPS };
     let mut steps = Steps::of(1 + PACKAGES.len() * each);
     steps.begin(&format!("programs for {}", architecture.name()));
-    let programs = programs(checkout, &options)?;
+    let programs = programs(checkout, architecture, options.programs, &[])?;
     println!("{}", programs.display());
     for source in &PACKAGES {
         let package = package(checkout, &mut steps, architecture, &programs, source)?;
@@ -110,15 +74,8 @@ pub(crate) fn packages(
 
 /// Checks that the tools for packages of `architecture` are installed.
 pub(crate) fn check_tools(checkout: &Checkout, architecture: Architecture) -> Result<(), Failure> {
-    for (tool, package) in
-        [("dpkg-deb", "dpkg"), ("gzip", "gzip"), (architecture.strip(), "binutils")]
-    {
-        if !steps::succeeds(checkout.command(tool).arg("--version")) {
-            return Err(Failure::new(Exit::Unreachable, format!("`{tool}` is missing"))
-                .with_help(format!("on Debian and Ubuntu, as root: apt-get install {package}")));
-        }
-    }
-    Ok(())
+    let strip = architecture.strip();
+    steps::require(checkout, &[("dpkg-deb", "dpkg"), ("gzip", "gzip"), (strip, "binutils")])
 }
 
 fn folder(checkout: &Checkout) -> PathBuf {
@@ -151,17 +108,26 @@ fn package(
     Ok(package)
 }
 
-fn programs(checkout: &Checkout, options: &DebOptions) -> Result<PathBuf, Failure> {
-    match &options.programs {
-        Some(folder) => Ok(folder.clone()),
-        None if options.architecture.is_of_this_machine() => {
-            setup::programs(checkout)?;
-            Ok(checkout.target().join("release"))
-        }
-        None if options.architecture == Architecture::Arm64 => aarch64::programs(checkout),
-        None => Err(Failure::new(Exit::Usage, "this machine builds no programs for amd64")
-            .with_help("build them elsewhere, and name their folder with --programs DIR")),
+/// Builds the programs of the packages and `others`, unless `built` is their folder; returns their
+/// folder.
+pub(crate) fn programs(
+    checkout: &Checkout,
+    architecture: Architecture,
+    built: Option<PathBuf>,
+    others: &[&str],
+) -> Result<PathBuf, Failure> {
+    if let Some(folder) = built {
+        return Ok(folder);
     }
+    if !architecture.is_of_this_machine() {
+        return aarch64::programs(checkout, &[others, &[PLAYER]].concat());
+    }
+    setup::programs(checkout)?;
+    if !others.is_empty() {
+        setup::binaries(checkout, others)?;
+    }
+    player::build(checkout)?;
+    Ok(checkout.target().join("release"))
 }
 
 fn build(
@@ -207,19 +173,22 @@ fn answer(command: &mut Command) -> Option<String> {
 mod tests {
     use super::*;
 
-    fn parse(arguments: &[&str]) -> Option<DebOptions> {
-        DebOptions::parse(&arguments.iter().map(OsString::from).collect::<Vec<_>>()).ok()
+    fn parse(arguments: &[&str]) -> Option<PackageOptions> {
+        let arguments: Vec<_> = arguments.iter().map(OsString::from).collect();
+        PackageOptions::parse(&arguments, USAGE).ok()
     }
 
     #[test]
     fn the_package_is_for_this_machine_unless_another_one_is_named() {
-        let here = Architecture::of_this_machine();
-        let options = DebOptions { architecture: here, programs: None, test: false };
-        assert_eq!(parse(&[]), Some(options));
+        let options = parse(&[]).unwrap();
+        assert_eq!(options.architecture, Architecture::of_this_machine());
+        assert_eq!((options.programs, options.test), (None, false));
         let options = parse(&["--arch", "arm64", "--programs", "built"]).unwrap();
         assert_eq!((options.architecture, options.test), (Architecture::Arm64, false));
         assert_eq!(options.programs, Some("built".into()));
-        for wrong in [&["--arch"][..], &["--arch", "mips"], &["--programs"], &["amd64"]] {
+        for wrong in
+            [&["--arch"][..], &["--arch", "mips"], &["--programs"], &["amd64"], &["--install"]]
+        {
             assert_eq!(parse(wrong), None, "{wrong:?}");
         }
     }

@@ -44,12 +44,7 @@ pub(super) fn test(
         return Err(Failure::new(Exit::Usage, "only root can install a package into a root")
             .with_help("run `cargo xtask deb`, then `sudo cargo xtask deb --test`"));
     }
-    for (tool, package) in [("debootstrap", "debootstrap"), ("unshare", "util-linux")] {
-        if !steps::succeeds(checkout.command(tool).arg("--version")) {
-            return Err(Failure::new(Exit::Unreachable, format!("`{tool}` is missing"))
-                .with_help(format!("on Debian and Ubuntu, as root: apt-get install {package}")));
-        }
-    }
+    steps::require(checkout, &[("debootstrap", "debootstrap"), ("unshare", "util-linux")])?;
     let base = base(checkout, work)?;
     let (root, arguments) = prepare(checkout, &base, work, package, source)?;
     println!("{}, without systemd", root.display());
@@ -84,8 +79,7 @@ fn base(checkout: &Checkout, work: &Path) -> Result<PathBuf, Failure> {
         let _ = fs::remove_dir_all(&unfinished);
         let mut make = checkout.command("debootstrap");
         make.args(["--variant=minbase", &format!("--include={PACKAGES}"), &suite]).arg(&unfinished);
-        steps::run(&mut make, "check the network")
-            .map_err(|failure| Failure { exit: Exit::Unreachable, ..failure })?;
+        steps::download(&mut make, "check the network")?;
         fs::rename(&unfinished, &base).map_err(|error| cannot("move", &base, &error))?;
     }
     Ok(base)

@@ -24,9 +24,12 @@ pub(crate) struct PackageSource {
 /// Folder of the parts, where the programs search for them.
 pub(crate) const LIB: &str = "usr/lib/gleaner";
 
+/// The program of `gleaner play`, and its package of cargo.
+pub(crate) const PLAYER: &str = "gleaner-player";
+
 /// Programs of a vehicle: the commands, the parts that those start, and the extension module of
 /// Python.
-pub(crate) const VEHICLE_PROGRAMS: [(&str, &str); 10] = [
+pub(crate) const VEHICLE_PROGRAMS: [(&str, &str); 11] = [
     ("gleaner", "usr/bin"),
     ("gleaner-orchestrator", "usr/bin"),
     ("gleaner-compile", LIB),
@@ -37,6 +40,7 @@ pub(crate) const VEHICLE_PROGRAMS: [(&str, &str); 10] = [
     ("gleaner-shim", LIB),
     ("gleaner-supervisor", LIB),
     ("lib_gleaner.so", LIB),
+    (PLAYER, LIB),
 ];
 
 /// Lambdas on a vehicle.
@@ -54,8 +58,10 @@ const VEHICLE: PackageSource = PackageSource {
         ("gleaner-orchestrator.8", "usr/share/man/man8/gleaner-orchestrator.8"),
         ("debian/copyright", "usr/share/doc/gleaner/copyright"),
         ("debian/README.Debian", "usr/share/doc/gleaner/README.Debian"),
+        ("../../examples/data/highway_drive.mcap", "usr/share/gleaner/highway_drive.mcap"),
+        ("../../examples/data/ATTRIBUTION.md", "usr/share/gleaner/ATTRIBUTION.md"),
     ],
-    cargo_packages: &[&setup::PROGRAMS],
+    cargo_packages: &[&setup::PROGRAMS, &[PLAYER]],
     has_command: true,
     exposure_max: 20,
 };
@@ -87,5 +93,37 @@ impl PackageSource {
 
     pub(super) fn unit(&self) -> String {
         format!("{}.service", self.name)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use serde_json::Value;
+
+    use super::*;
+    use crate::checkout::Checkout;
+
+    #[test]
+    fn the_packages_have_every_program_that_is_built_and_files_that_exist() {
+        let checkout = Checkout::find().unwrap();
+        let mut metadata = checkout.cargo();
+        metadata.args(["metadata", "--no-deps", "--format-version", "1"]);
+        let metadata: Value = serde_json::from_slice(&metadata.output().unwrap().stdout).unwrap();
+        let name = |it: &Value| it["name"].as_str().unwrap().to_owned();
+        let built = metadata["packages"].as_array().unwrap().iter();
+        let built = built.filter(|package| setup::PROGRAMS.contains(&name(package).as_str()));
+        let built = built.flat_map(|package| package["targets"].as_array().unwrap());
+        let mut built: BTreeSet<_> = built.filter(|it| it["kind"][0] == "bin").map(name).collect();
+        // A library, and a program that is built separately.
+        built.extend(["lib_gleaner.so", PLAYER].map(str::to_owned));
+        let packed = PACKAGES.iter().flat_map(|source| source.programs.concat());
+        assert_eq!(packed.map(|(name, _)| name.to_owned()).collect::<BTreeSet<_>>(), built);
+        for source in &PACKAGES {
+            let folder = checkout.path(source.folder);
+            let missing = source.files.iter().find(|(file, _)| !folder.join(file).is_file());
+            assert_eq!(missing, None);
+        }
     }
 }

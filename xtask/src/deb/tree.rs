@@ -13,14 +13,12 @@ use crate::checkout::Checkout;
 use crate::onnxruntime;
 use crate::steps::{self, cannot};
 
-/// Completion scripts of shells.
 const COMPLETIONS: [(&str, &str); 3] = [
     ("bash", "usr/share/bash-completion/completions/gleaner"),
     ("zsh", "usr/share/zsh/vendor-completions/_gleaner"),
     ("fish", "usr/share/fish/vendor_completions.d/gleaner.fish"),
 ];
 
-/// A folder with the files of a package.
 pub(crate) struct PackageTree {
     root: PathBuf,
 }
@@ -35,9 +33,7 @@ impl PackageTree {
         source: &PackageSource,
     ) -> Result<Self, Failure> {
         let tree = Self { root: root.to_owned() };
-        if root.exists() {
-            fs::remove_dir_all(root).map_err(|error| cannot("remove", root, &error))?;
-        }
+        steps::remove_folder(root)?;
         for (name, folder) in source.programs.iter().copied().flatten() {
             let file = tree.place(&programs.join(name), &Path::new(folder).join(name))?;
             // Symbols are most of the size. A panic names its place without them.
@@ -80,7 +76,6 @@ impl PackageTree {
         &self.root
     }
 
-    /// Writes a file.
     pub(crate) fn write(&self, place: &str, text: &str) -> Result<PathBuf, Failure> {
         let file = self.parent(Path::new(place))?;
         fs::write(&file, text).map_err(|error| cannot("write", &file, &error))?;
@@ -176,7 +171,7 @@ impl PackageTree {
         let to = self.parent(place)?;
         fs::copy(file, &to).map_err(|error| {
             cannot("copy", file, &error)
-                .with_help("`cargo xtask build` builds all programs; or name their folder")
+                .with_help("without `--programs`, `cargo xtask deb` builds all programs")
         })?;
         Ok(to)
     }
@@ -190,7 +185,6 @@ impl PackageTree {
     }
 }
 
-/// Reads a file of the project.
 pub(super) fn read(file: &Path) -> Result<String, Failure> {
     fs::read_to_string(file).map_err(|error| cannot("read", file, &error))
 }

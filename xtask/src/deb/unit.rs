@@ -8,7 +8,7 @@ use super::answer;
 use super::source::PackageSource;
 use super::tree::{self, PackageTree};
 use crate::checkout::Checkout;
-use crate::steps::{self, cannot};
+use crate::steps::{self, cannot, write_file};
 
 /// The first version that knows the keys of `control-groups.conf`.
 const WITH_SUBGROUPS: u32 = 254;
@@ -36,7 +36,7 @@ pub(super) fn check(
     let unit = folder.join(source.unit());
     let dropin = folder.join("gleaner.service.d/control-groups.conf");
     let _ = std::fs::remove_dir_all(&folder);
-    write(
+    write_file(
         &unit,
         &moved(tree::read(&tree.root().join("usr/lib/systemd/system").join(source.unit()))?),
     )?;
@@ -45,7 +45,7 @@ pub(super) fn check(
     if !groups.exists() {
         // It is of the package of vehicles only.
     } else if version.is_some_and(|version| version >= WITH_SUBGROUPS) {
-        write(&dropin, &moved(tree::read(&groups)?))?;
+        write_file(&dropin, &moved(tree::read(&groups)?))?;
     } else {
         println!("skipped: control-groups.conf needs systemd {WITH_SUBGROUPS}");
     }
@@ -86,13 +86,6 @@ fn parse_exposure(text: &str) -> Option<u32> {
     let line = text.lines().find(|line| line.contains("Overall exposure level"))?;
     let (whole, tenth) = line.rsplit_once(": ")?.1.split_whitespace().next()?.split_once('.')?;
     Some(whole.parse::<u32>().ok()? * 10 + tenth.parse::<u32>().ok()?)
-}
-
-fn write(file: &Path, text: &str) -> Result<(), Failure> {
-    let folder = file.parent().unwrap_or(file);
-    std::fs::create_dir_all(folder)
-        .and_then(|()| std::fs::write(file, text))
-        .map_err(|error| cannot("write", file, &error))
 }
 
 #[cfg(test)]

@@ -3,13 +3,14 @@
 
 use std::collections::BTreeMap;
 
-use gleaner_base::{Exit, Failure};
+use gleaner_base::Failure;
 use gleaner_fleet::clips::FleetClip;
 use gleaner_lambda::{Clip, Decision};
 use gleaner_protocol::vehicle_api::StreamLine;
 use gleaner_report::format::counted;
 
 use super::demo_vehicle::{DemoVehicle, NAME, file};
+use crate::steps::parsed;
 
 /// Number of records that are read of a lambda: far more than a run has.
 const RECORDS: &str = "100000";
@@ -29,7 +30,8 @@ pub(super) fn run(vehicle: &DemoVehicle, ids: &[String], recorded: &[Clip]) -> R
         println!("  {id:<21} triggers: {}", if labels.is_empty() { "none" } else { &labels });
     }
     let clips = vehicle.look_until("the clips and their thumbnails in the cloud", || {
-        let clips: Vec<FleetClip> = parsed(&vehicle.gleaner(&["clips", "--json"])?)?;
+        let clips: Vec<FleetClip> =
+            parsed(&vehicle.gleaner(&["clips", "--json"])?, "gleaner clips")?;
         let is_shown = |clip: &FleetClip| clip.has_thumbnail || clip.facts.thumbnail.is_none();
         Ok((clips.len() == recorded.len() && clips.iter().all(is_shown)).then_some(clips))
     })?;
@@ -52,18 +54,13 @@ fn triggers(
     let lines = vehicle.gleaner(&[&["logs", id, "--json", "-n", RECORDS], on].concat())?;
     let mut labels = BTreeMap::new();
     for line in lines.lines() {
-        let line: StreamLine = parsed(line)?;
+        let line: StreamLine = parsed(line, "gleaner logs")?;
         if line.kind == "decision" {
-            let decision: Decision = parsed(&line.record.to_string())?;
+            let decision: Decision = parsed(&line.record.to_string(), "gleaner logs")?;
             for trigger in decision.triggers {
                 *labels.entry(trigger.label).or_default() += 1;
             }
         }
     }
     Ok(labels)
-}
-
-fn parsed<T: serde::de::DeserializeOwned>(text: &str) -> Result<T, Failure> {
-    serde_json::from_str(text)
-        .map_err(|error| Failure::caused_by(Exit::Internal, "`gleaner` gave no result", &error))
 }

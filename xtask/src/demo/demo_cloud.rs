@@ -1,6 +1,6 @@
 //! The cloud of the demo, in the user's network.
 
-use std::fs::{self, File};
+use std::fs::File;
 use std::io::{BufRead, BufReader};
 use std::net::TcpListener;
 use std::os::unix::process::CommandExt;
@@ -8,7 +8,7 @@ use std::process::{Child, Command, Stdio};
 
 use gleaner_base::{Exit, Failure};
 
-use super::demo_vehicle::{end, remove};
+use super::demo_vehicle::end;
 use crate::checkout::Checkout;
 use crate::steps;
 
@@ -35,10 +35,10 @@ impl DemoCloud {
     /// Starts the cloud without any user or vehicle, and logs in.
     pub(super) fn start(checkout: &Checkout) -> Result<Self, Failure> {
         let failed = |error| Failure::caused_by(Exit::Internal, "cannot start a cloud", &error);
-        let prepared = remove(&checkout.path(DATA))
-            .and_then(|()| remove(&checkout.path(CONFIG)))
-            .and_then(|()| fs::create_dir_all(checkout.path("out/demo")))
-            .and_then(|()| File::create(checkout.path("out/demo/cloud.log")));
+        steps::remove_folder(&checkout.path(DATA))?;
+        steps::remove_folder(&checkout.path(CONFIG))?;
+        steps::make_folder(&checkout.path("out/demo"))?;
+        let log = File::create(checkout.path("out/demo/cloud.log")).map_err(failed)?;
         let mut serve = checkout.command(checkout.program("gleaner-cloud"));
         serve.args(["serve", "--data", DATA]);
         for (option, port) in ["--people", "--vehicles"].into_iter().zip(PORTS) {
@@ -47,7 +47,7 @@ impl DemoCloud {
         }
         // Ctrl-C in a terminal reaches the demo only, which then ends all in order.
         serve.process_group(0);
-        serve.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(prepared.map_err(failed)?);
+        serve.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(log);
         let mut program = serve.spawn().map_err(failed)?;
         let lines = program.stdout.take().map(BufReader::new).into_iter().flat_map(BufRead::lines);
         let mut cloud = Self { program: Some(program), ports: [0; 2], url: String::new() };

@@ -2,7 +2,6 @@
 //! if it has one.
 
 use std::fs::{self, File};
-use std::io;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
@@ -32,7 +31,6 @@ const SETTINGS: &str = "[vehicle]\nname = \"demo-car\"\nlabels = { fleet = \"dem
 /// Longest wait for anything: far longer than needed.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// Time between two looks at the status.
 const POLL_INTERVAL: Duration = Duration::from_millis(200);
 
 /// The vehicle. Dropping it ends all of its processes.
@@ -56,9 +54,9 @@ impl<'c> DemoVehicle<'c> {
         has_cloud: bool,
     ) -> Result<Self, Failure> {
         let (out, ends) = (checkout.path(OUT), Arc::new(AtomicBool::new(false)));
-        let prepared = remove(&out)
-            .and_then(|()| fs::create_dir_all(&out))
-            .and_then(|()| fs::write(out.join("vehicle.toml"), SETTINGS))
+        steps::remove_folder(&out)?;
+        steps::make_folder(&out)?;
+        let prepared = fs::write(out.join("vehicle.toml"), SETTINGS)
             .and_then(|()| signal_hook::flag::register(SIGTERM, Arc::clone(&ends)))
             .and_then(|_| File::create(out.join("orchestrator.log")));
         let log = prepared.map_err(|error| {
@@ -124,7 +122,6 @@ impl<'c> DemoVehicle<'c> {
         self.look_until(what, || Ok(self.status().and_then(|status| wanted(&status))))
     }
 
-    /// Waits until `look` returns a value.
     pub(super) fn look_until<T>(
         &self,
         what: &str,
@@ -144,7 +141,6 @@ impl<'c> DemoVehicle<'c> {
         Err(Failure::new(Exit::Internal, message).with_help(see_log()))
     }
 
-    /// Waits until the demo is to end.
     pub(super) fn until_end(&self) {
         while !self.ends.load(Ordering::Relaxed) {
             thread::sleep(POLL_INTERVAL);
@@ -182,7 +178,6 @@ pub(super) fn file(name: &str) -> String {
     format!("{OUT}/{name}")
 }
 
-/// Sends a signal to a process.
 pub(super) fn signal(pid: u32, signal: Signal) -> Result<(), Failure> {
     let pid = i32::try_from(pid).ok().and_then(Pid::from_raw);
     let pid = pid.ok_or_else(|| Failure::new(Exit::Internal, "the process has no number"))?;
@@ -211,12 +206,4 @@ pub(super) fn end(mut program: Child, name: &str) -> Result<(), Failure> {
 
 fn see_log() -> String {
     format!("the logs are `{OUT}/orchestrator.log` and `out/demo/cloud.log`")
-}
-
-/// Removes a folder, if there is one.
-pub(super) fn remove(folder: &Path) -> io::Result<()> {
-    match fs::remove_dir_all(folder) {
-        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
-        _ => Ok(()),
-    }
 }

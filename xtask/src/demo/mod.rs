@@ -57,7 +57,7 @@ pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, F
     })?;
     let mut steps = Steps::of(setup::STEPS + 4 + usize::from(options.has_cloud));
     let lambdas: Vec<_> = EXAMPLES.iter().flat_map(Example::lambdas).collect();
-    setup::run_for_replays(checkout, &mut steps, &lambdas)?;
+    setup::run_with(checkout, &mut steps, &lambdas, setup::replay_programs)?;
     let (with_models, others): (Vec<_>, Vec<_>) = EXAMPLES.iter().partition(|it| it.has_models);
     steps.begin(&format!("replay of {DRIVE}"));
     let others_agree = drive::run(checkout, &others)?;

@@ -78,16 +78,16 @@ fn copy(mut from: UnixStream, mut to: UnixStream) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::test_folder::TestFolder;
 
     #[test]
     fn a_connection_crosses_both_relays_and_ends_in_each_direction() {
-        let folder = std::env::temp_dir().join(format!("gleaner-relay-{}", std::process::id()));
-        fs::create_dir(&folder).unwrap();
+        let folder = TestFolder::new();
         let server = TcpListener::bind(local(0)).unwrap();
         let port = server.local_addr().unwrap().port();
-        out_of(&folder, &[port]).unwrap();
+        out_of(folder.root(), &[port]).unwrap();
         // Both networks are one here: the outer half is enough.
-        let mut client = UnixStream::connect(folder.join(port.to_string())).unwrap();
+        let mut client = UnixStream::connect(folder.path(&port.to_string())).unwrap();
         let (mut served, _) = server.accept().unwrap();
         client.write_all(b"question").unwrap();
         client.shutdown(Shutdown::Write).unwrap();
@@ -99,6 +99,5 @@ mod tests {
         text.clear();
         client.read_to_string(&mut text).unwrap();
         assert_eq!(text, "answer");
-        fs::remove_dir_all(&folder).unwrap();
     }
 }

@@ -1,12 +1,10 @@
 //! The second part of the demo: starts the cloud, if there is one, and `vehicle_run` in a private
 //! network, so that no DDS participant of another program sees it. A relay connects both.
 
-use std::fs::{self, DirBuilder};
+use std::fs;
 use std::io::{self, Read};
-use std::os::unix::fs::DirBuilderExt;
 use std::os::unix::net::UnixStream;
 use std::os::unix::process::CommandExt;
-use std::path::{Path, PathBuf};
 use std::process::{Command, ExitStatus, Stdio};
 use std::thread;
 
@@ -18,6 +16,7 @@ use super::demo_cloud::DemoCloud;
 use super::{DemoOptions, relay, vehicle_run};
 use crate::checkout::Checkout;
 use crate::player;
+use crate::private_folder::PrivateFolder;
 use crate::steps::{self, Steps};
 
 /// Shell script that prepares the network for DDS, then becomes the program in `$0`.
@@ -56,12 +55,14 @@ pub(super) fn run(
     })?;
     let failed =
         |error| Failure::caused_by(Exit::Internal, "cannot start a private network", &error);
-    let run = RunFolder::create().map_err(failed)?;
+    // The folder of the sockets: in a temporary place, as their paths must be short.
+    let run = PrivateFolder::create("demo")?;
+    fs::create_dir(run.path().join("relay")).map_err(failed)?;
     let mut vehicle = shell(checkout, unshare);
-    vehicle.arg(program).arg(vehicle_run::COMMAND).arg(&run.0);
+    vehicle.arg(program).arg(vehicle_run::COMMAND).arg(run.path());
     let cloud = options.has_cloud.then(|| DemoCloud::start(checkout)).transpose()?;
     if let Some(cloud) = &cloud {
-        relay::out_of(&run.0.join("relay"), &cloud.ports).map_err(failed)?;
+        relay::out_of(&run.path().join("relay"), &cloud.ports).map_err(failed)?;
         vehicle.arg(vehicle_run::BY_CLOUD);
         if options.stays_open {
             vehicle.arg(&cloud.url);
@@ -71,26 +72,6 @@ pub(super) fn run(
     cloud.map_or(Ok(()), DemoCloud::stop)?;
     // It has printed its error.
     Ok(status.code().and_then(Exit::from_code).unwrap_or(Exit::Internal))
-}
-
-/// The folder of the sockets: in a temporary place, as their paths must be short.
-struct RunFolder(PathBuf);
-
-impl RunFolder {
-    fn create() -> io::Result<Self> {
-        let folder = std::env::temp_dir().join(format!("gleaner-demo-{}", std::process::id()));
-        let private = |path: &Path| DirBuilder::new().mode(0o700).create(path);
-        private(&folder)?;
-        let folder = Self(folder);
-        private(&folder.0.join("relay"))?;
-        Ok(folder)
-    }
-}
-
-impl Drop for RunFolder {
-    fn drop(&mut self) {
-        let _ = fs::remove_dir_all(&self.0);
-    }
 }
 
 /// Runs the part in the private network to its end. Ctrl-C, and other wishes that the demo ends,

@@ -25,6 +25,7 @@ use super::drive::table;
 use super::{arrivals, relay};
 use crate::checkout::Checkout;
 use crate::examples::{DRIVE, EXAMPLES, Example};
+use crate::steps::{copy_files, parsed};
 
 /// The command of xtask that runs it: for the demo only.
 pub(crate) const COMMAND: &str = "demo-vehicle";
@@ -112,9 +113,7 @@ pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, F
 /// Prints how to open the page, and waits until the demo is to end.
 fn leave_open(vehicle: &DemoVehicle, page: &str) -> Result<(), Failure> {
     let invitation = vehicle.gleaner(&["users", "invite", "you", "--role", "admin", "--json"])?;
-    let invitation: Invitation = serde_json::from_str(&invitation).map_err(|error| {
-        Failure::caused_by(Exit::Internal, "`gleaner users invite` gave no code", &error)
-    })?;
+    let invitation: Invitation = parsed(&invitation, "gleaner users invite")?;
     println!(
         "\nThe vehicle and the cloud run on. Look at all of this on the page:\n\n  \
          {page}/vehicles/{NAME}/events\n  log in by the one-time code {}\n\n\
@@ -170,10 +169,8 @@ fn play(checkout: &Checkout) -> Result<Child, Failure> {
     let mut player = checkout.command(checkout.program("gleaner-player"));
     player.args([DRIVE, "--topics", TOPICS, "--wait", "1", "--json"]);
     player.args(["--duration", &PLAYED_S.to_string()]);
+    let player = player.stdin(Stdio::null()).stdout(Stdio::null()).spawn();
     player
-        .stdin(Stdio::null())
-        .stdout(Stdio::null())
-        .spawn()
         .map_err(|error| Failure::caused_by(Exit::Internal, "cannot start gleaner-player", &error))
 }
 
@@ -262,10 +259,7 @@ fn verify(vehicle: &DemoVehicle, recorded: &[Clip]) -> Result<(), Failure> {
         if clip.lambdas.iter().any(|lambda| lambda.name == REPEATED) {
             let lambda = folder(REPEATED);
             let arguments = ["verify", &path, "--trust", &trust, "--lambda", &lambda, "--json"];
-            let verified: Verified =
-                serde_json::from_str(&vehicle.gleaner(&arguments)?).map_err(|error| {
-                    Failure::caused_by(Exit::Internal, "`gleaner verify` gave no result", &error)
-                })?;
+            let verified: Verified = parsed(&vehicle.gleaner(&arguments)?, "gleaner verify")?;
             let same = verified.wakes.saturating_sub(verified.uncovered);
             println!("    {} decisions of `{REPEATED}` repeated, all identical", grouped(same));
             all += same;
@@ -304,19 +298,4 @@ fn clip_path(vehicle: &DemoVehicle, clip: &Clip) -> String {
     } else {
         file(&format!("state/clips/{}", clip.file.display()))
     }
-}
-
-/// Copies all files and folders in `from` to `to`.
-fn copy_files(from: &Path, to: &Path) -> io::Result<()> {
-    fs::create_dir_all(to)?;
-    for entry in fs::read_dir(from)? {
-        let entry = entry?;
-        let target = to.join(entry.file_name());
-        if entry.file_type()?.is_dir() {
-            copy_files(&entry.path(), &target)?;
-        } else {
-            fs::copy(entry.path(), target)?;
-        }
-    }
-    Ok(())
 }

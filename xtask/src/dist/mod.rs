@@ -9,12 +9,11 @@ use std::path::{Path, PathBuf};
 
 use gleaner_base::{Exit, Failure};
 
-use crate::aarch64::{self, Tools};
-use crate::architecture::Architecture;
+use crate::aarch64::Tools;
 use crate::checkout::{Checkout, FAMILIES};
-use crate::deb::{self, PackagedCommit};
+use crate::deb::{self, PackageOptions, PackagedCommit};
 use crate::steps::{self, Steps, cannot};
-use crate::{glibc, player, setup};
+use crate::{glibc, setup};
 use tarball::TARBALL;
 
 const USAGE: &str =
@@ -24,69 +23,20 @@ const USAGE: &str =
   --programs  folder with the built programs; default: build them
   --install   as root: install the compilers for the target first";
 
-/// Packages of cargo with programs of the tarball that are in no other package.
-const BENCH: [&str; 2] = ["gleaner-bench", "gleaner-player"];
+/// The package of cargo, and its program, that only the tarball has.
+const BENCH: &str = "gleaner-bench";
 
-#[derive(Debug, PartialEq, Eq)]
-struct DistOptions {
-    architecture: Architecture,
-    out: Option<PathBuf>,
-    programs: Option<PathBuf>,
-    install: bool,
-}
-
-impl DistOptions {
-    fn parse(arguments: &[OsString]) -> Result<Self, Failure> {
-        let architecture = Architecture::of_this_machine();
-        let mut options = Self { architecture, out: None, programs: None, install: false };
-        let mut arguments = arguments.iter();
-        while let Some(argument) = arguments.next() {
-            let mut value = || arguments.next().ok_or_else(usage);
-            match argument.to_str() {
-                Some("--install") => options.install = true,
-                Some("--out") => options.out = Some(value()?.into()),
-                Some("--programs") => options.programs = Some(value()?.into()),
-                Some("--target") => {
-                    let name = value()?;
-                    let known = Architecture::ALL.into_iter().find(|it| name == it.machine());
-                    options.architecture = known.ok_or_else(usage)?;
-                }
-                _ => return Err(usage()),
-            }
-        }
-        let is_built_here = options.architecture.is_of_this_machine()
-            || options.architecture == Architecture::Arm64;
-        if !is_built_here && options.programs.is_none() {
-            return Err(Failure::new(Exit::Usage, "this machine builds no programs for x86_64")
-                .with_help("build them elsewhere, and name their folder with --programs DIR"));
-        }
-        Ok(options)
-    }
-}
-
-fn usage() -> Failure {
-    Failure::new(Exit::Usage, "`cargo xtask dist` does not take these arguments").with_help(USAGE)
-}
-
-/// Builds everything.
 pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
-    let options = DistOptions::parse(arguments)?;
+    let options = PackageOptions::parse(arguments, USAGE)?;
     let (architecture, machine) = (options.architecture, options.architecture.machine());
+    let checkout = &deb::with_commit(checkout);
     let mut steps = Steps::of(setup::STEPS + deb::ALL_STEPS + 4);
     steps.begin(&format!("tools for {machine}"));
-    let tools = tools(checkout, &options)?;
+    check_compilers(checkout, &options)?;
     deb::check_tools(checkout, architecture)?;
     setup::run(checkout, &mut steps, &checkout.lambdas(&FAMILIES))?;
     steps.begin(&format!("programs for {machine} (the first time this takes half an hour)"));
-    let programs = match (&options.programs, &tools) {
-        (Some(folder), _) => folder.clone(),
-        (None, Some(tools)) => aarch64::programs_with_player(checkout, tools, &BENCH)?,
-        (None, None) => {
-            setup::binary(checkout, "gleaner-bench")?;
-            player::build(checkout)?;
-            checkout.target().join("release")
-        }
-    };
+    let programs = deb::programs(checkout, architecture, options.programs, &[BENCH])?;
     println!("{}", programs.display());
     steps.begin(&format!("the C library that they need, at most {}", glibc::OF_JETPACK));
     let names = TARBALL.programs.iter().copied().flatten();
@@ -117,16 +67,18 @@ fn folder(checkout: &Checkout) -> PathBuf {
     checkout.target().join("dist")
 }
 
-/// Finds or installs the tools for another architecture; `None` if none are needed.
-fn tools(checkout: &Checkout, options: &DistOptions) -> Result<Option<Tools>, Failure> {
+/// Finds or installs the compilers for another architecture. With the programs built, only binutils
+/// are needed.
+fn check_compilers(checkout: &Checkout, options: &PackageOptions) -> Result<(), Failure> {
     if options.architecture.is_of_this_machine() {
-        return Ok(None);
+        Ok(())
+    } else if options.install {
+        Tools::install(checkout).map(drop)
+    } else if options.programs.is_none() {
+        Tools::find(checkout).map(drop)
+    } else {
+        Ok(())
     }
-    if options.install {
-        return Tools::install(checkout).map(Some);
-    }
-    // With the programs built, only binutils are needed.
-    if options.programs.is_some() { Ok(None) } else { Tools::find(checkout).map(Some) }
 }
 
 /// Writes the sums of all files beside them.
@@ -141,9 +93,11 @@ fn write_sums(checkout: &Checkout, out: &Path, files: &[PathBuf]) -> Result<(), 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::architecture::Architecture;
 
-    fn parse(arguments: &[&str]) -> Option<DistOptions> {
-        DistOptions::parse(&arguments.iter().map(OsString::from).collect::<Vec<_>>()).ok()
+    fn parse(arguments: &[&str]) -> Option<PackageOptions> {
+        let arguments: Vec<_> = arguments.iter().map(OsString::from).collect();
+        PackageOptions::parse(&arguments, USAGE).ok()
     }
 
     #[test]

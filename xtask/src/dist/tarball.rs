@@ -10,7 +10,7 @@ use gleaner_base::Failure;
 use super::BENCH;
 use crate::architecture::Architecture;
 use crate::checkout::{Checkout, FAMILIES};
-use crate::deb::{LIB, PackageSource, PackageTree, PackagedCommit, VEHICLE_PROGRAMS};
+use crate::deb::{PLAYER, PackageSource, PackageTree, PackagedCommit, VEHICLE_PROGRAMS};
 use crate::setup;
 use crate::steps::{self, cannot};
 
@@ -18,12 +18,9 @@ use crate::steps::{self, cannot};
 pub(super) const TARBALL: PackageSource = PackageSource {
     name: "gleaner",
     folder: "",
-    programs: &[
-        &VEHICLE_PROGRAMS,
-        &[("gleaner-cloud", "usr/bin"), ("gleaner-bench", "usr/bin"), ("gleaner-player", LIB)],
-    ],
+    programs: &[&VEHICLE_PROGRAMS, &[("gleaner-cloud", "usr/bin"), (BENCH, "usr/bin")]],
     files: &[("LICENSE", "usr/LICENSE"), ("xtask/src/dist/README", "usr/README")],
-    cargo_packages: &[&setup::PROGRAMS, &BENCH],
+    cargo_packages: &[&setup::PROGRAMS, &[BENCH, PLAYER]],
     has_command: true,
     // It has no service.
     exposure_max: 0,
@@ -53,7 +50,9 @@ pub(super) fn create(
     }
     for lambda in checkout.lambdas(&FAMILIES) {
         if FOLDERS.iter().any(|folder| lambda.starts_with(folder)) {
-            place_folder(checkout, &tree, &lambda.join("build"))?;
+            let (from, to) = (checkout.path(&lambda), tree.root().join("usr").join(&lambda));
+            steps::copy_files(&from.join("build"), &to.join("build"))
+                .map_err(|error| cannot("copy", &from, &error))?;
         }
     }
     let mut revision = checkout.command("git");
@@ -66,21 +65,6 @@ pub(super) fn create(
     let file = out.join(format!("{name}.tar.gz"));
     pack(checkout, tree.root(), &name, &commit.time, &file)?;
     Ok(file)
-}
-
-/// Places all files below a folder of the checkout.
-fn place_folder(checkout: &Checkout, tree: &PackageTree, folder: &Path) -> Result<(), Failure> {
-    let path = checkout.path(folder);
-    for entry in fs::read_dir(&path).map_err(|error| cannot("read", &path, &error))? {
-        let entry = entry.map_err(|error| cannot("read", &path, &error))?;
-        let place = folder.join(entry.file_name());
-        if entry.path().is_dir() {
-            place_folder(checkout, tree, &place)?;
-        } else {
-            tree.place(&entry.path(), &Path::new("usr").join(place))?;
-        }
-    }
-    Ok(())
 }
 
 /// Packs the folder `name` in `root` into `file`. The same files become the same bytes: they are
@@ -106,6 +90,7 @@ mod tests {
     use std::process::Command;
 
     use super::*;
+    use crate::test_folder::TestFolder;
 
     /// Texts of the program's source after `call("`, up to the next quotation mark.
     fn arguments(folder: &Path, call: &str, found: &mut BTreeSet<String>) {
@@ -146,20 +131,18 @@ mod tests {
     #[test]
     fn the_same_files_become_the_same_bytes() {
         let checkout = Checkout::find().unwrap();
-        let folder = checkout.target().join(format!("tarball-test-{}", std::process::id()));
+        let folder = TestFolder::new();
         let packed = |names: [&str; 2], file: &str| {
-            let _ = fs::remove_dir_all(folder.join("a"));
-            fs::create_dir_all(folder.join("a")).unwrap();
-            names.iter().for_each(|name| fs::write(folder.join("a").join(name), name).unwrap());
-            let file = folder.join(file);
-            pack(&checkout, &folder, "a", "86400", &file).unwrap();
+            let _ = fs::remove_dir_all(folder.path("a"));
+            names.iter().for_each(|name| drop(folder.write(&format!("a/{name}"), name)));
+            let file = folder.path(file);
+            pack(&checkout, folder.root(), "a", "86400", &file).unwrap();
             file
         };
         let files = [packed(["x", "y"], "1.tar.gz"), packed(["y", "x"], "2.tar.gz")];
         let list =
             Command::new("tar").arg("-tvf").arg(&files[1]).env("TZ", "UTC").output().unwrap();
         let bytes = files.map(|file| fs::read(file).unwrap());
-        fs::remove_dir_all(&folder).unwrap();
         assert_eq!(bytes[0], bytes[1]);
         let list = String::from_utf8(list.stdout).unwrap();
         let lines: Vec<_> = list.lines().collect();

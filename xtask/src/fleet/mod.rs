@@ -50,7 +50,6 @@ impl FleetOptions {
     }
 }
 
-/// Runs the command.
 pub(crate) fn run_scaled(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
     let options = FleetOptions::parse(arguments).ok_or_else(|| Failure::new(Exit::Usage, USAGE))?;
     let mut steps = Steps::of(3);
@@ -68,7 +67,7 @@ pub(crate) fn run_scaled(checkout: &Checkout, arguments: &[OsString]) -> Result<
     steps.begin("programs (the first time this takes minutes)");
     setup::programs(checkout)?;
     if options.kills > 0 {
-        setup::binary(checkout, "gleaner-fleet-bench")?;
+        setup::binaries(checkout, &["gleaner-fleet-bench"])?;
     }
     steps.begin("three replicas");
     let mut cloud = ScaledCloud::start(checkout)?;
@@ -92,7 +91,7 @@ fn install(checkout: &Checkout) -> Result<(), Failure> {
     }
     if find(checkout, "moto_server").is_none() {
         // It has many packages.
-        venv::apart(checkout, &checkout.target().join("fleet/venv"), &[("moto[server]", "moto")])?;
+        venv::apart(checkout, &checkout.target().join("fleet/venv"), &["moto[server]"])?;
     }
     Ok(())
 }

@@ -5,7 +5,7 @@ use std::io::{self, Read, Write};
 use std::net::{SocketAddr, TcpStream};
 use std::os::unix::fs::{MetadataExt, PermissionsExt, chown};
 use std::os::unix::process::CommandExt;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::Command;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -17,7 +17,8 @@ use signal_hook::consts::{SIGINT, SIGTERM};
 
 use super::services::{Service, find, free_addresses};
 use crate::checkout::Checkout;
-use crate::steps::output;
+use crate::private_folder::PrivateFolder;
+use crate::steps::{copy_files, output};
 
 /// User of PostgreSQL if root runs this: it refuses to run as root.
 const NOBODY: u32 = 65534;
@@ -35,22 +36,7 @@ pub(super) struct ScaledCloud {
     /// In the order in which they are killed.
     services: Vec<Service>,
     _store: Service,
-    _folder: FleetFolder,
-}
-
-/// The folder of everything, removed with this value.
-struct FleetFolder(PathBuf);
-
-impl Drop for FleetFolder {
-    fn drop(&mut self) {
-        // The last processes of PostgreSQL end, and write, after it was killed.
-        for _ in 0..50 {
-            if fs::remove_dir_all(&self.0).is_ok() || !self.0.exists() {
-                return;
-            }
-            sleep(Duration::from_millis(100));
-        }
-    }
+    _folder: PrivateFolder,
 }
 
 impl ScaledCloud {
@@ -62,9 +48,8 @@ impl ScaledCloud {
         for signal in [SIGINT, SIGTERM] {
             signal_hook::flag::register(signal, Arc::clone(&is_stopping)).map_err(failed)?;
         }
-        let path = std::env::temp_dir().join(format!("gleaner-fleet-{}", std::process::id()));
-        fs::create_dir(&path).map_err(failed)?;
-        let folder = FleetFolder(path.clone());
+        let folder = PrivateFolder::create("fleet")?;
+        let path = folder.path().to_owned();
         fs::set_permissions(&path, Permissions::from_mode(0o755)).map_err(failed)?;
         println!("logs are in {}", path.display());
         let [database, bus, store, people, vehicles] = free_addresses::<5>()?;
@@ -87,7 +72,7 @@ impl ScaledCloud {
             let data = path.join(format!("data-{index}"));
             if index > 0 {
                 // All replicas have the same authorities.
-                copy_authorities(&path.join("data-0"), &data).map_err(failed)?;
+                copy_files(&path.join("data-0/ca"), &data.join("ca")).map_err(failed)?;
             }
             let [people_of, vehicles_of] = [listeners[2 * index], listeners[2 * index + 1]];
             let mut replica = Command::new(checkout.program("gleaner-cloud"));
@@ -173,15 +158,6 @@ fn make_bucket(store: SocketAddr) -> io::Result<()> {
         true => Ok(()),
         false => Err(io::Error::other(format!("the object store answers {answer}"))),
     }
-}
-
-fn copy_authorities(from: &Path, to: &Path) -> io::Result<()> {
-    fs::create_dir_all(to.join("ca"))?;
-    for entry in fs::read_dir(from.join("ca"))? {
-        let entry = entry?;
-        fs::copy(entry.path(), to.join("ca").join(entry.file_name()))?;
-    }
-    Ok(())
 }
 
 /// Returns the code that a replica has printed: that of the newest one counts.

@@ -16,7 +16,6 @@ use crate::checkout::Checkout;
 
 /// Time for a program to listen.
 const START: Duration = Duration::from_secs(60);
-/// Time between two looks.
 const LOOK: Duration = Duration::from_millis(50);
 
 /// A running program with its processes, which end with this value.
@@ -76,7 +75,6 @@ impl Service {
         Ok(())
     }
 
-    /// Kills the program, and starts it again.
     pub(super) fn kill_and_start(&mut self) -> Result<(), Failure> {
         let _ = self.child.kill();
         let _ = self.child.wait();
@@ -106,7 +104,6 @@ pub(super) fn free_addresses<const N: usize>() -> Result<[SocketAddr; N], Failur
     Ok(addresses)
 }
 
-/// Returns the path of a program.
 pub(super) fn find(checkout: &Checkout, name: &str) -> Option<PathBuf> {
     let own = checkout.target().join("fleet/venv/bin");
     let path = std::env::var_os("PATH").unwrap_or_default();

@@ -44,8 +44,8 @@ pub(super) struct LibtestParser {
     pub(super) counts: TestCounts,
     /// The test program that cargo started last.
     program: String,
-    /// True while that program runs tests and has not printed its result.
-    is_open: bool,
+    /// Number of the tests of that program, until it has printed its result.
+    running: Option<u64>,
     /// The test whose output follows.
     test: String,
     /// Number of tests of that program that printed that they were skipped.
@@ -66,18 +66,17 @@ impl LibtestParser {
             self.begin(program_name(program.trim_end_matches(')')));
         } else if let Some(package) = line.strip_prefix("Doc-tests ") {
             self.begin(format!("docs of {package}"));
-        } else if line
-            .strip_prefix("running ")
-            .is_some_and(|rest| rest.ends_with(" test") || rest.ends_with(" tests"))
-        {
-            self.close();
-            self.is_open = true;
+        } else if let Some(number) = running_tests(line) {
+            // Within a program, a test shows the output of another one.
+            self.running.get_or_insert(number);
         } else if let Some(counts) = line.strip_prefix("test result: ") {
-            self.is_open = false;
-            let passed = counts.split_once(" passed").map_or("", |(before, _)| before);
-            let digits = passed.trim_end_matches(|c: char| c.is_ascii_digit()).len();
-            let passed = passed[digits..].parse::<u64>().unwrap_or(0);
-            self.counts.passed += passed.saturating_sub(std::mem::take(&mut self.printed));
+            let of = |kind: &str| count_before(counts, kind);
+            let passed = of(" passed");
+            let all = passed + of(" failed") + of(" ignored") + of(" measured");
+            if self.running == Some(all) {
+                self.running = None;
+                self.counts.passed += passed.saturating_sub(std::mem::take(&mut self.printed));
+            }
         } else if let Some(name) = line.strip_prefix("---- ") {
             self.test = name.split(" stdout").next().unwrap_or(name).to_owned();
         } else if let Some(test) = line.strip_prefix("test ") {
@@ -105,10 +104,23 @@ impl LibtestParser {
     /// Counts a failure if a test program began but printed no result, since it was killed or
     /// aborted.
     pub(super) fn close(&mut self) {
-        if std::mem::take(&mut self.is_open) {
+        if self.running.take().is_some() {
             self.counts.fail(&format!("{}: ended during its tests", self.program));
         }
     }
+}
+
+/// Returns the number in `running 2 tests`.
+fn running_tests(line: &str) -> Option<u64> {
+    let (number, word) = line.strip_prefix("running ")?.split_once(' ')?;
+    number.parse().ok().filter(|_| ["test", "tests"].contains(&word))
+}
+
+/// Returns the number before `kind` in the result of a program; 0 without one.
+fn count_before(counts: &str, kind: &str) -> u64 {
+    let before = counts.split_once(kind).map_or("", |(before, _)| before);
+    let digits = before.trim_end_matches(|c: char| c.is_ascii_digit()).len();
+    before[digits..].parse().unwrap_or(0)
 }
 
 /// `rooms` of `target/release/deps/rooms-0123456789abcdef`.
@@ -135,8 +147,9 @@ mod tests {
                     test a::b ... ok\ntest c ... ignored, needs a GPU\n\nsuccesses:\n\n---- a::b stdout ----\n\
                     skipped: no drive\n\n\
                     test result: ok. 12 passed; 0 failed; 1 ignored; 0 measured; 0 filtered out\n\
-                    \x20    Running tests/rooms.rs (target/release/deps/rooms-77)\n\nrunning 1 test\n\
-                    test the_house   ... FAILED\n\
+                    \x20    Running tests/rooms.rs (target/release/deps/rooms-77)\n\nrunning 4 tests\n\
+                    test the_house   ... FAILED\n---- shown stdout ----\nrunning 1 test\n\
+                    test result: ok. 1 passed; 0 failed; 0 ignored; 0 measured; 3 filtered out\n\
                     test result: FAILED. 3 passed; 1 failed; 0 ignored; 0 measured; 0 filtered out\n\
                     \x20  Doc-tests gleaner_sdk\n\nrunning 0 tests\n\n\
                     test result: ok. 0 passed; 0 failed; 0 ignored; 0 measured; 0 filtered out\n";

@@ -1,8 +1,10 @@
 //! `cargo xtask test`: runs all test suites, two at a time, and prints the total counts.
 //!
-//! All suites run even if one fails. `junit` and `counts` read the results of their test runners.
+//! All suites run even if one fails. `group` runs one in bounds, and `junit` and `counts` read the
+//! results of their test runners.
 
 mod counts;
+mod group;
 mod junit;
 mod memory;
 
@@ -10,36 +12,35 @@ use std::collections::VecDeque;
 use std::env;
 use std::ffi::OsString;
 use std::fs;
-use std::io::{self, BufRead, BufReader, Write};
+use std::io::{self, Write};
 use std::path::PathBuf;
-use std::process::{Command, ExitStatus, Stdio};
+use std::process::Command;
 use std::sync::Mutex;
 use std::thread;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Failure};
 
 use crate::architecture::Architecture;
-use crate::bindings;
 use crate::checkout::{Checkout, FAMILIES};
 use crate::fuzz;
-use crate::metadata::Metadata;
 use crate::onnxruntime;
 use crate::player;
 use crate::setup;
-use crate::steps::{Steps, succeeds};
+use crate::steps::{self, Steps, succeeds};
 use crate::venv;
 use counts::{LibtestParser, TestCounts};
+use group::SuiteBounds;
 
 /// Features with which `.ci/run` checks the workspace.
 const LINTED: &str = "gleaner-fuzz/programs";
 
-/// Test programs that receive samples in real time, or kill processes at chosen moments: without
-/// nextest, none runs beside another of them. With it, `.config/nextest.toml` limits them.
-const REAL_TIME: [&str; 4] = ["dds", "kills", "live", "vehicle"];
-
 /// Number of suites that run at a time. Most tests wait for processes and clocks.
 const AT_A_TIME: usize = 2;
+
+/// Time after which a suite is ended. Suites compile their tests first; on two ordinary cores, all
+/// of them take a fifth of it.
+const TIME_MAX: Duration = Duration::from_secs(3600);
 
 struct Suite {
     name: String,
@@ -75,11 +76,8 @@ const READ_SHARED: &str = "binary(drives) | binary(house) | binary(vision) \
 /// Sets up and runs all tests, or with `--shared` those of [`READ_SHARED`]. The last line is
 /// `N passed, M failed, K skipped`.
 pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
-    match arguments {
-        [] => run_tests(checkout),
-        [one] if one == "--shared" => run_shared(checkout),
-        _ => Err(Failure::new(Exit::Usage, "`cargo xtask test` takes `--shared` or nothing")),
-    }
+    let is_shared = steps::has_flag("test", "--shared", arguments)?;
+    if is_shared { run_shared(checkout) } else { run_tests(checkout) }
 }
 
 fn run_shared(checkout: &Checkout) -> Result<Exit, Failure> {
@@ -101,7 +99,7 @@ fn run_tests(checkout: &Checkout) -> Result<Exit, Failure> {
     steps.begin("mypy, pytest, drive readers, notebook tools and ONNX Runtime");
     venv::set_up_for_tests(checkout)?;
     onnxruntime::fetch(checkout, Architecture::of_this_machine());
-    let mut suites = suites(checkout)?;
+    let mut suites = suites(checkout);
     suites.extend(player_suites(checkout)?);
     steps.begin(&format!("{} suites, {AT_A_TIME} at a time", suites.len()));
     let folder = memory::MemoryFolder::new();
@@ -118,13 +116,15 @@ fn run_tests(checkout: &Checkout) -> Result<Exit, Failure> {
 fn run_all(suites: Vec<Suite>) -> Vec<EndedSuite> {
     let waiting = Mutex::new(suites.into_iter().enumerate().collect::<VecDeque<_>>());
     let ended = Mutex::new(Vec::new());
+    let bounds = SuiteBounds::new(TIME_MAX);
+    bounds.end_by_signals();
     let next = || waiting.lock().unwrap_or_else(|it| it.into_inner()).pop_front();
     let work = || {
         while let Some((index, Suite { name, action })) = next() {
             let mut output = SuiteOutput { block: Vec::new(), is_shown: index == 0 };
             output.line(format!("== {name} ==\n").as_bytes());
             let started = Instant::now();
-            let counts = action.run(&mut output);
+            let counts = action.run(&bounds, &mut output);
             let seconds = started.elapsed().as_secs_f64();
             output.end();
             let suite = EndedSuite { name, counts, seconds };
@@ -141,7 +141,7 @@ fn run_all(suites: Vec<Suite>) -> Vec<EndedSuite> {
     ended.into_iter().map(|(_, suite)| suite).collect()
 }
 
-/// SuiteOutput of a suite: shown, or collected until its end.
+/// Output of a suite: shown, or collected until its end.
 struct SuiteOutput {
     block: Vec<u8>,
     is_shown: bool,
@@ -211,47 +211,22 @@ fn cargo_test(checkout: &Checkout, arguments: &[&str]) -> Command {
 }
 
 /// The tests of the default members. To build nextest takes minutes, so it is used where it is
-/// installed; cargo alone runs the same tests.
-fn rust_tests(checkout: &Checkout) -> Result<Vec<Suite>, Failure> {
+/// installed; cargo alone runs the same tests, one program after the other, so that none of those
+/// in real time runs beside another.
+fn rust_tests(checkout: &Checkout) -> [Suite; 2] {
     let test = |name: &str, arguments: &[&str]| {
-        suite(
-            &format!("cargo test: {name}"),
-            cargo_test(checkout, arguments),
-            SuiteResults::Libtest,
-        )
+        suite(name, cargo_test(checkout, arguments), SuiteResults::Libtest)
     };
-    let mut suites = if has_nextest(checkout) {
-        vec![nextest(checkout, &[])]
+    let tests = if has_nextest(checkout) {
+        nextest(checkout, &[])
     } else {
-        let others = test_programs(checkout)?;
-        let others: Vec<_> = others.iter().flat_map(|name| ["--test", name]).collect();
-        vec![
-            // First, as it builds examples that the others start.
-            test("units", &["--lib", "--bins", "--examples"]),
-            test("programs", &others),
-            test("programs in real time", &REAL_TIME.map(|name| ["--test", name]).concat()),
-        ]
+        test("cargo test", &["--lib", "--bins", "--examples", "--tests"])
     };
     // nextest does not run the examples of the documentation.
-    suites.push(test("examples of the documentation", &["--doc"]));
-    Ok(suites)
+    [tests, test("cargo test: examples of the documentation", &["--doc"])]
 }
 
-/// Names of the test programs of the default members, without those in [`REAL_TIME`].
-fn test_programs(checkout: &Checkout) -> Result<Vec<String>, Failure> {
-    let metadata = Metadata::read(checkout)?;
-    let targets = metadata.default_members().flat_map(|package| &package.targets);
-    let tests = targets.filter(|target| target.kind == ["test"] && target.test);
-    let mut names: Vec<_> = tests
-        .map(|target| target.name.clone())
-        .filter(|name| !REAL_TIME.contains(&name.as_str()))
-        .collect();
-    names.sort();
-    names.dedup();
-    Ok(names)
-}
-
-fn suites(checkout: &Checkout) -> Result<Vec<Suite>, Failure> {
+fn suites(checkout: &Checkout) -> Vec<Suite> {
     // In a separate target folder, since its flags would recompile everything else.
     let mut loom = checkout.cargo();
     loom.args(["test", "--release", "-p", "gleaner-buffers", "--test", "loom"])
@@ -259,11 +234,11 @@ fn suites(checkout: &Checkout) -> Result<Vec<Suite>, Failure> {
         .env("RUSTFLAGS", "--cfg loom")
         .env("LOOM_MAX_PREEMPTIONS", "3");
 
-    let mut suites = rust_tests(checkout)?;
+    let mut suites = Vec::from(rust_tests(checkout));
     suites.extend([
         suite(
             "cargo test: bindings of the Rust SDK",
-            bindings::test(checkout),
+            setup::test_bindings(checkout),
             SuiteResults::Libtest,
         ),
         suite("loom: orders of threads in gleaner-buffers", loom, SuiteResults::Libtest),
@@ -280,7 +255,7 @@ fn suites(checkout: &Checkout) -> Result<Vec<Suite>, Failure> {
             .env("MYPYPATH", checkout.path("guest-sdk-python"));
         suite(&format!("mypy: {}", file.display()), mypy, SuiteResults::Status)
     }));
-    Ok(suites)
+    suites
 }
 
 /// The tests in these folders, relative to the checkout, by pytest.
@@ -300,12 +275,10 @@ fn pytest(checkout: &Checkout, name: &str, folders: &[&str]) -> Suite {
 
 /// Suites of the player, if it was built: it is not a default member.
 fn player_suites(checkout: &Checkout) -> Result<Vec<Suite>, Failure> {
-    let suite = |name: &str, action| Suite { name: name.to_owned(), action };
+    let name = "cargo test: player";
     if !checkout.program("gleaner-player").is_file() {
-        return Ok(vec![suite(
-            "cargo test: player",
-            SuiteAction::Skip("no gleaner-player; run: cargo xtask player"),
-        )]);
+        let action = SuiteAction::Skip("no gleaner-player; run: cargo xtask player");
+        return Ok(vec![Suite { name: name.to_owned(), action }]);
     }
     // With the features of the whole workspace, and in lints with those of `.ci/run`, so that
     // nothing is built twice.
@@ -315,8 +288,8 @@ fn player_suites(checkout: &Checkout) -> Result<Vec<Suite>, Failure> {
     let mut tests = player::cargo(checkout, &player::compiler())?;
     tests.arg("test").args(only);
     Ok(vec![
-        suite("lints: player", SuiteAction::Run(Box::new(lints), SuiteResults::Status)),
-        suite("cargo test: player", SuiteAction::Run(Box::new(tests), SuiteResults::Libtest)),
+        suite("lints: player", lints, SuiteResults::Status),
+        suite(name, tests, SuiteResults::Libtest),
     ])
 }
 
@@ -355,12 +328,17 @@ fn miri(checkout: &Checkout) -> SuiteAction {
 }
 
 impl SuiteAction {
-    fn run(self, output: &mut SuiteOutput) -> TestCounts {
+    fn run(self, bounds: &SuiteBounds, output: &mut SuiteOutput) -> TestCounts {
         match self {
             SuiteAction::Skip(why) => {
                 output.line(format!("skipped: {why}\n").as_bytes());
                 let mut counts = TestCounts::default();
                 counts.skip("all", why);
+                counts
+            }
+            SuiteAction::Run(..) if bounds.is_interrupted() => {
+                let mut counts = TestCounts::default();
+                counts.fail("interrupted before it began");
                 counts
             }
             SuiteAction::Run(command, results) => {
@@ -370,10 +348,18 @@ impl SuiteAction {
                     let _ = fs::remove_file(file);
                 }
                 let mut parser = LibtestParser::default();
-                let ended = show(*command, output, |line| results.parse_line(&mut parser, line));
+                let ended = group::run(*command, bounds, |line| {
+                    output.line(line);
+                    results.parse_line(&mut parser, String::from_utf8_lossy(line).trim_end());
+                });
                 let (is_success, status) = match ended {
                     Ok(status) => (status.success(), format!("ended with {status}")),
-                    Err(error) => (false, format!("cannot run `{program}`: {error}")),
+                    Err(error) => {
+                        let status = format!("`{program}` did not run to its end: {error}");
+                        // Beside the tests that have failed before.
+                        parser.counts.fail(&status);
+                        (false, status)
+                    }
                 };
                 results.count(parser, is_success, &status)
             }
@@ -416,23 +402,18 @@ impl SuiteResults {
     }
 }
 
-/// Runs a suite, shows the output of both streams in order, and passes each line to `parse`.
-fn show(
-    mut command: Command,
-    output: &mut SuiteOutput,
-    mut parse: impl FnMut(&str),
-) -> io::Result<ExitStatus> {
-    let (reader, writer) = io::pipe()?;
-    let mut child =
-        command.stdin(Stdio::null()).stdout(writer.try_clone()?).stderr(writer).spawn()?;
-    // The command holds write ends of the pipe: with them open, reading would never end.
-    drop(command);
-    let mut reader = BufReader::new(reader);
-    let mut line = Vec::new();
-    while reader.read_until(b'\n', &mut line)? > 0 {
-        output.line(&line);
-        parse(String::from_utf8_lossy(&line).trim_end());
-        line.clear();
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_suite_beyond_its_time_is_a_failure_with_that_time() {
+        let mut command = Command::new("sh");
+        command.args(["-c", "echo 'running 1 test'; sleep 600 & sleep 600"]);
+        let slow = suite("slow", command, SuiteResults::Libtest);
+        let mut output = SuiteOutput { block: Vec::new(), is_shown: false };
+        let bounds = SuiteBounds::new(Duration::from_secs(1));
+        let counts = slow.action.run(&bounds, &mut output);
+        assert!(counts.failed[0].contains("`sh` did not run to its end: not ended after 1s"));
     }
-    child.wait()
 }

@@ -17,7 +17,6 @@ use rustix::fs::{CWD, FlockOperation, RenameFlags, flock, renameat_with};
 use super::export::TABLE;
 use crate::vehicle::VehicleClient;
 
-/// A clip and the place for its file.
 pub(super) struct ClipTarget<'c> {
     clip: &'c FleetClip,
     sha256: &'c str,
@@ -25,7 +24,6 @@ pub(super) struct ClipTarget<'c> {
 }
 
 impl<'c> ClipTarget<'c> {
-    /// Returns the place of a clip in a folder.
     pub(super) fn of(folder: &Path, clip: &'c FleetClip) -> Result<Self, Failure> {
         let sha256 = clip.facts.sha256.as_deref().ok_or_else(|| {
             Failure::new(Exit::Internal, format!("the cloud has no SHA-256 of clip `{}`", clip.id))
@@ -99,18 +97,16 @@ impl<'c> ClipTarget<'c> {
             Failure::caused_by(Exit::Usage, format!("cannot read `{shown}`"), &error)
         })?;
         compared.map(|()| true).map_err(|reason| {
-            let mut failure =
-                Failure::new(Exit::Usage, format!("`{shown}` exists, and is another file"));
-            failure.causes = vec![reason];
-            failure.with_help("choose another folder with --to DIR")
+            let message = format!("`{shown}` exists, and is another file");
+            Failure { causes: vec![reason], ..Failure::new(Exit::Usage, message) }
+                .with_help("choose another folder with --to DIR")
         })
     }
 
     fn refused(&self, reason: &str) -> Failure {
         let message = format!("the cloud sent another file than clip `{}`", self.clip.id);
-        let mut failure = Failure::new(Exit::Denied, message);
-        failure.causes = vec![reason.to_owned()];
-        failure.with_help("run this again")
+        Failure { causes: vec![reason.to_owned()], ..Failure::new(Exit::Denied, message) }
+            .with_help("run this again")
     }
 
     fn compare(&self, path: &Path) -> io::Result<Result<(), String>> {

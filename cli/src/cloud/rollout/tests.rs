@@ -67,7 +67,13 @@ fn a_vehicle_is_done_once_it_runs_the_new_revision() {
 fn a_vehicle_that_will_not_run_the_new_revision_has_failed_with_the_reason() {
     let fallback =
         json!({ "runs_fallback": true, "failed": "it faults", "status": lambda("running", 6) });
+    let mut running = lambda("running", 5);
+    running["recent"] = json!({ "wakes": 20, "faults": 20, "backed_off": 0 });
+    assert!(judge(NEW, json!({ "status": running })).is_done(), "after its probation");
+    let faulty = json!({ "is_proven": false, "fallback": null, "status": running });
+    let reason = "it runs 0.2.0, but 20 of its last 20 wakes ended with a fault";
     for (fields, exit, reason) in [
+        (faulty, Exit::LambdaFaulted, reason),
         (json!({ "refused": "no key" }), Exit::Denied, "it refuses it: no key"),
         (fallback, Exit::LambdaFaulted, "it runs its fallback 0.1.0: it faults"),
         (

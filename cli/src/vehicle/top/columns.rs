@@ -7,8 +7,9 @@ use gleaner_report::format::{grouped, size};
 
 use super::super::status::{NO_DEPLOYMENTS, shared};
 use super::figures::{LambdaFigures, ProgramFigures, VehicleFigures};
+use crate::render::{or_dash, table};
 
-/// Spaces between two columns.
+/// Spaces between two columns, as in [`table`].
 pub(super) const GAP: usize = 2;
 
 pub(super) struct Column {
@@ -27,14 +28,14 @@ static COLUMNS: [Column; 15] = [
     Column { head: "p99 ms", rank: 5, cell: |it| ms(it.wake_p99_ns) },
     Column { head: "run p99", rank: 10, cell: |it| ms(it.run_p99_ns) },
     Column { head: "CPU %", rank: 2, cell: |it| decimal(it.cpu_percent) },
-    Column { head: "memory", rank: 4, cell: |it| bytes(it.rss_bytes) },
-    Column { head: "lost", rank: 6, cell: |it| count(it.losses) },
-    Column { head: "faults", rank: 7, cell: |it| count(it.faults) },
-    Column { head: "restarts", rank: 8, cell: |it| count(it.restarts.map(u64::from)) },
-    Column { head: "triggers", rank: 9, cell: |it| count(it.triggers) },
-    Column { head: "clips", rank: 11, cell: |it| count(it.clips) },
-    Column { head: "recorded", rank: 13, cell: |it| bytes(it.clip_bytes) },
-    Column { head: "wakes", rank: 14, cell: |it| count(it.wakes) },
+    Column { head: "memory", rank: 4, cell: |it| or_dash(it.rss_bytes, size) },
+    Column { head: "lost", rank: 6, cell: |it| or_dash(it.losses, grouped) },
+    Column { head: "faults", rank: 7, cell: |it| or_dash(it.faults, grouped) },
+    Column { head: "restarts", rank: 8, cell: |it| or_dash(it.restarts, grouped) },
+    Column { head: "triggers", rank: 9, cell: |it| or_dash(it.triggers, grouped) },
+    Column { head: "clips", rank: 11, cell: |it| or_dash(it.clips, grouped) },
+    Column { head: "recorded", rank: 13, cell: |it| or_dash(it.clip_bytes, size) },
+    Column { head: "wakes", rank: 14, cell: |it| or_dash(it.wakes, grouped) },
 ];
 
 impl Column {
@@ -75,19 +76,12 @@ pub(super) fn text(figures: &VehicleFigures, width: usize) -> String {
     if figures.lambdas.is_empty() {
         return text + NO_DEPLOYMENTS + "\n";
     }
-    let columns: Vec<_> = fitting(&figures.lambdas, width).collect();
-    let mut line = |cell: &dyn Fn(&Column) -> String| {
-        let cells = columns.iter().map(|(column, width)| match column.is_number() {
-            true => format!("{:>width$}", cell(column)),
-            false => format!("{:<width$}", cell(column)),
-        });
-        text += cells.collect::<Vec<_>>().join(&" ".repeat(GAP)).trim_end();
-        text.push('\n');
-    };
-    line(&|column| column.head.to_owned());
-    for lambda in &figures.lambdas {
-        line(&|column| (column.cell)(lambda));
-    }
+    let columns: Vec<_> = fitting(&figures.lambdas, width).map(|(column, _)| column).collect();
+    let head: Vec<_> = columns.iter().map(|column| column.head).collect();
+    let cells =
+        |lambda: &LambdaFigures| columns.iter().map(|it| (it.cell)(lambda)).collect::<Vec<_>>();
+    let numbers: Vec<_> = (0..head.len()).filter(|index| columns[*index].is_number()).collect();
+    text += &table(&head, figures.lambdas.iter().map(cells), &numbers);
     for lambda in &figures.lambdas {
         for reason in &lambda.reasons {
             text += &format!("{}: {reason}\n", visible(&lambda.id));
@@ -146,19 +140,11 @@ fn program(program: &ProgramFigures) -> String {
 }
 
 fn decimal(value: Option<f64>) -> String {
-    value.map_or_else(|| "-".to_owned(), |value| format!("{value:.1}"))
+    or_dash(value, |value| format!("{value:.1}"))
 }
 
 fn ms(ns: Option<u64>) -> String {
-    ns.map_or_else(|| "-".to_owned(), |ns| format!("{:.2}", ns as f64 / 1e6))
-}
-
-fn bytes(bytes: Option<u64>) -> String {
-    bytes.map_or_else(|| "-".to_owned(), size)
-}
-
-fn count(count: Option<u64>) -> String {
-    count.map_or_else(|| "-".to_owned(), grouped)
+    or_dash(ns, |ns| format!("{:.2}", ns as f64 / 1e6))
 }
 
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -172,39 +158,31 @@ pub(super) enum RowOrder {
     Losses,
 }
 
+/// An order, with the head and the number of its column.
+type OrderColumn = (RowOrder, &'static str, fn(&LambdaFigures) -> Option<f64>);
+
 impl RowOrder {
+    /// All of them as they are declared: `self as usize` is the index.
+    const ALL: [OrderColumn; 6] = [
+        (Self::Id, "id", |_| None),
+        (Self::Cpu, "CPU %", |it| it.cpu_percent),
+        (Self::Memory, "memory", |it| it.rss_bytes.map(|it| it as f64)),
+        (Self::Wakes, "wakes/s", |it| it.wakes_per_s),
+        (Self::Latency, "p99 ms", |it| it.wake_p99_ns.map(|it| it as f64)),
+        (Self::Losses, "lost", |it| it.losses.map(|it| it as f64)),
+    ];
+
     pub(super) fn next(self) -> Self {
-        match self {
-            Self::Id => Self::Cpu,
-            Self::Cpu => Self::Memory,
-            Self::Memory => Self::Wakes,
-            Self::Wakes => Self::Latency,
-            Self::Latency => Self::Losses,
-            Self::Losses => Self::Id,
-        }
+        Self::ALL[(self as usize + 1) % Self::ALL.len()].0
     }
 
     pub(super) fn head(self) -> &'static str {
-        match self {
-            Self::Id => "id",
-            Self::Cpu => "CPU %",
-            Self::Memory => "memory",
-            Self::Wakes => "wakes/s",
-            Self::Latency => "p99 ms",
-            Self::Losses => "lost",
-        }
+        Self::ALL[self as usize].1
     }
 
     /// Sorts rows: ids from A to Z, numbers from the highest down, unknown ones last.
     pub(super) fn sort(self, lambdas: &mut [LambdaFigures]) {
-        let number = |it: &LambdaFigures| match self {
-            Self::Id => None,
-            Self::Cpu => it.cpu_percent,
-            Self::Memory => it.rss_bytes.map(|it| it as f64),
-            Self::Wakes => it.wakes_per_s,
-            Self::Latency => it.wake_p99_ns.map(|it| it as f64),
-            Self::Losses => it.losses.map(|it| it as f64),
-        };
+        let number = Self::ALL[self as usize].2;
         lambdas.sort_by(|a, b| {
             let [one, other] = [a, b].map(|it| number(it).unwrap_or(f64::NEG_INFINITY));
             other.partial_cmp(&one).unwrap_or(Ordering::Equal).then_with(|| a.id.cmp(&b.id))

@@ -24,7 +24,6 @@ pub(super) struct VehicleFigures {
     pub(super) lambdas: Vec<LambdaFigures>,
 }
 
-/// The cost of a program.
 #[derive(Debug, Serialize)]
 pub(super) struct ProgramFigures {
     /// CPU time in percent of a core.

@@ -21,8 +21,7 @@ use serde_json::json;
 
 use super::client::VehicleClient;
 use crate::args::TopArgs;
-use crate::render::json_line;
-use crate::stdout::{end_with_reader, print, print_to_reader};
+use crate::output::{end_with_reader, print_json, show};
 use figures::VehicleFigures;
 
 /// Time from a poll to the next. The processes report their counts as often.
@@ -33,8 +32,8 @@ const POLL_INTERVAL: Duration = Duration::from_secs(1);
 const POLLS_KEPT: usize = 4;
 
 pub(crate) fn top(args: &TopArgs) -> Result<Exit, Failure> {
-    let client = VehicleClient::of(&args.vehicle, &args.on)?;
-    if !args.once && !args.vehicle.json && !stdout().is_terminal() {
+    let client = VehicleClient::of(&args.source)?;
+    if !args.once && !args.source.vehicle.json && !stdout().is_terminal() {
         return Err(Failure::new(Exit::Usage, "`gleaner top` needs a terminal")
             .with_help("`--once` prints a table, and `--json` an object for each poll"));
     }
@@ -43,11 +42,10 @@ pub(crate) fn top(args: &TopArgs) -> Result<Exit, Failure> {
     }
     let mut polls = Polls::default();
     polls.add(client.status()?);
-    match (args.once, args.vehicle.json) {
+    match (args.once, args.source.vehicle.json) {
         (true, json) => {
             let figures = once(&client, &mut polls)?;
-            print(&if json { json_line(&figures) } else { columns::text(&figures, width()) })?;
-            Ok(Exit::Ok)
+            show(json, &figures, |figures| columns::text(figures, width()))
         }
         (false, true) => follow(&client, &mut polls),
         (false, false) => screen::run(client, polls),
@@ -98,18 +96,18 @@ fn width() -> usize {
 /// Prints an object for each poll, until its reader closes the pipe.
 fn follow(client: &VehicleClient, polls: &mut Polls) -> Result<Exit, Failure> {
     let mut answered = Instant::now();
-    let mut line = json_line(&polls.figures());
-    while print_to_reader(&line)? {
+    let mut line = json!(polls.figures());
+    while print_json(&line)? {
         thread::sleep(POLL_INTERVAL);
         line = match client.status() {
             Ok(status) => {
                 answered = Instant::now();
                 polls.add(status);
-                json_line(&polls.figures())
+                json!(polls.figures())
             }
             Err(failure) => {
                 let for_s = answered.elapsed().as_secs_f64();
-                json_line(&json!({ "unreachable": failure.message, "for_s": for_s }))
+                json!({ "unreachable": failure.message, "for_s": for_s })
             }
         };
     }

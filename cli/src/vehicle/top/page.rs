@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use gleaner_base::{format_duration, visible};
 use gleaner_protocol::vehicle_api::{DeploymentStatus, VehicleStatus};
-use gleaner_protocol::{DurationStats, LiveStatus, LiveTopic};
+use gleaner_protocol::{LiveStatus, LiveTopic};
 use gleaner_report::format::grouped;
 use ratatui::Frame;
 use ratatui::layout::{Constraint, Layout, Rect};
@@ -16,7 +16,7 @@ use super::super::status::NO_DEPLOYMENTS;
 use super::columns::{self, RowOrder};
 use super::figures::{LambdaFigures, losses};
 use super::{POLL_INTERVAL, Polls};
-use crate::render::{isolation, table};
+use crate::render::{in_ms, isolation, table};
 
 /// Time without an answer from which the page shows it.
 const SILENCE: Duration = POLL_INTERVAL.saturating_mul(3);
@@ -37,7 +37,6 @@ impl Page {
         Self { polls, ..Self::default() }
     }
 
-    /// Shows the result of a poll.
     pub(super) fn add(&mut self, polled: Result<VehicleStatus, String>) {
         self.failure = polled.map(|status| self.polls.add(status)).err();
     }
@@ -177,12 +176,8 @@ fn details(lambda: &LambdaFigures, deployment: &DeploymentStatus) -> Vec<Line<'s
 }
 
 fn durations(live: &LiveStatus) -> Option<String> {
-    let ms = |ns: u64| format!("{:.2}", ns as f64 / 1e6);
-    let of = |what: &str, stats: DurationStats| {
-        format!("{what} {} / {} / {}", ms(stats.p50_ns), ms(stats.p99_ns), ms(stats.max_ns))
-    };
-    let (latency, run) = (live.wake_latency?, live.run_time?);
-    Some(format!("{}, {} ms (p50 / p99 / max)", of("wake latency", latency), of("run time", run)))
+    let [latency, run] = [live.wake_latency?, live.run_time?].map(|stats| in_ms(&stats, 2));
+    Some(format!("wake latency {latency}, run time {run} ms (p50 / p99 / max)"))
 }
 
 fn topics(live: &LiveStatus) -> String {
@@ -193,6 +188,5 @@ fn topics(live: &LiveStatus) -> String {
             .map_or_else(|| "none".to_owned(), |ns| format!("{:.1} s", ns as f64 / 1e9));
         [visible(&topic.topic), format!("{:.1}", topic.rate_hz), lost, age]
     };
-    let head = ["topic", "Hz", "lost", "age"].map(str::to_owned);
-    table(std::iter::once(head).chain(live.topics.iter().map(row)).collect(), &[1, 2, 3])
+    table(&["topic", "Hz", "lost", "age"], live.topics.iter().map(row), &[1, 2, 3])
 }

@@ -2,7 +2,6 @@
 //! of their own, as an orchestrator that is stopped does not answer.
 
 use std::io;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, sync_channel};
 use std::thread;
@@ -12,10 +11,10 @@ use gleaner_base::{Exit, Failure};
 use gleaner_protocol::vehicle_api::VehicleStatus;
 use ratatui::DefaultTerminal;
 use ratatui::crossterm::event::{self, Event, KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
-use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use super::page::Page;
 use super::{POLL_INTERVAL, Polls};
+use crate::run::stop_flag;
 use crate::vehicle::VehicleClient;
 
 /// Longest wait for a key, until signals and polls are looked at.
@@ -27,11 +26,7 @@ pub(super) fn run(client: VehicleClient, polls: Polls) -> Result<Exit, Failure> 
         Failure::caused_by(Exit::Internal, action, error)
             .with_help("`--once` prints a table, and `--json` an object for each poll")
     };
-    let ends = Arc::new(AtomicBool::new(false));
-    for signal in [SIGINT, SIGTERM, SIGHUP] {
-        signal_hook::flag::register(signal, Arc::clone(&ends))
-            .map_err(|error| failed("cannot handle signals", &error))?;
-    }
+    let ends = stop_flag()?;
     let polled = poll(client).map_err(|error| failed("cannot start a thread", &error))?;
     // It also restores the terminal in a panic.
     let mut terminal =

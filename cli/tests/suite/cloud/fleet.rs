@@ -1,5 +1,7 @@
 //! `fleet`, and `deploy`, `start`, `stop`, `rollback` and `remove` with `--fleet`.
 
+mod refused;
+
 use std::fs;
 
 use gleaner_lambda::manifest::{LambdaKind, Sha256};
@@ -45,16 +47,16 @@ impl CloudUser {
         self.cloud.answers("GET /v1/deployments/brake/reported", &[reported]);
     }
 
-    /// Sets the deployment that the cloud has, which the deployer of this key has signed: version
-    /// 0.1.0, with the rights that its manifest asks for and one more. Returns the digest of its
-    /// revision.
-    fn has_former(&self, release: u64, key: &str) -> Sha256 {
+    /// Sets the release that the cloud has, which the deployer of this key has signed, and the
+    /// release of its revision: version 0.1.0, with the rights that its manifest asks for and one
+    /// more. Returns the digest of its revision.
+    fn has_former(&self, (release, revision): (u64, u64), key: &str) -> Sha256 {
         let manifest = MANIFEST.replace("0.2.0", "0.1.0") + INPUT;
         let revision = Revision {
             name: "brake".parse().unwrap(),
             version: "0.1.0".parse().unwrap(),
             kind: LambdaKind::Python,
-            release: 1,
+            release: revision,
             created: 1,
             files: vec![RevisionFile {
                 path: "lambda.toml".parse().unwrap(),
@@ -121,7 +123,6 @@ impl CloudUser {
     }
 }
 
-/// Returns a list with these entries.
 fn list(items: Value) -> Value {
     json!({ "items": items })
 }
@@ -130,7 +131,7 @@ fn accepted() -> Value {
     json!({ "result": "accepted", "id": "brake", "attempt": 0, "generation": 3 })
 }
 
-fn on_vehicle(release: u64, phase: &str) -> Value {
+pub fn on_vehicle(release: u64, phase: &str) -> Value {
     json!({
         "id": "brake", "release": release, "envelope": "$sent", "attempt": 5, "lambda": "brake",
         "revision": { "digest": "new", "version": "0.2.0", "release": 1 },
@@ -174,7 +175,7 @@ fn ended(deployments: &[Value]) -> (u16, Value) {
 #[test]
 fn a_deployment_to_a_fleet_sends_missing_files_and_waits_for_each_vehicle() {
     let user = CloudUser::with_lambda();
-    let former = user.has_former(6, "key.pem");
+    let former = user.has_former((6, 1), "key.pem");
     let main = "x = 0\n";
     let digest = gleaner_base::hex(&<sha2::Sha256 as sha2::Digest>::digest(main));
     let missing = json!({
@@ -217,6 +218,16 @@ fn a_deployment_to_a_fleet_sends_missing_files_and_waits_for_each_vehicle() {
     assert_eq!(sent.fallback, Some(former));
     let topics: Vec<_> = sent.grants.topics.iter().map(ToString::to_string).collect();
     assert_eq!((topics, sent.grants.record), (vec!["/imu".to_owned()], false));
+    // One that failed on one of two vehicles is a fallback, and one that failed on both is none.
+    let none = "none, as the one before failed on 2 vehicles and has none\n";
+    for (failed, fallback) in [(1, "brake 0.1.0 (release 1)\n"), (2, none)] {
+        let mut stored = in_cloud(6);
+        stored["failed"] = json!(failed);
+        user.cloud.answers("GET /v1/deployments", &[(200, list(json!([stored])))]);
+        let text = user.done(&arguments);
+        assert!(text.starts_with(&format!("fallback: {fallback}")), "{text}");
+    }
+    assert_eq!(user.sent().fallback, None);
 }
 
 #[test]
@@ -225,7 +236,7 @@ fn what_no_key_of_the_deployer_signed_is_no_part_of_the_next_signature() {
     user.vehicles(&[("car-7", "online", json!({ "site": "berlin" }))]);
     user.statuses("car-7", &[on_vehicle(7, "running")]);
     user.done(&["keys", "new", "stranger.pem"]);
-    user.has_former(6, "stranger.pem");
+    user.has_former((6, 1), "stranger.pem");
     let text = user.fails(3, &DEPLOY);
     assert!(text.contains("the deployment before this one cannot be verified"), "{text}");
     assert!(text.contains("--trust FILE"), "{text}");
@@ -240,7 +251,7 @@ fn what_no_key_of_the_deployer_signed_is_no_part_of_the_next_signature() {
     assert!(sent.fallback.is_some() && sent.release == 7);
     // Another manifest than the signed one, which asks for more.
     let line = "GET /v1/deployments/brake/envelopes";
-    user.has_former(6, "key.pem");
+    user.has_former((6, 1), "key.pem");
     let mut parts = user.cloud.answer(line);
     parts["revisions"][0]["manifest"] = json!(MANIFEST.to_owned() + INPUT);
     user.cloud.answers(line, &[(200, parts)]);
@@ -248,7 +259,7 @@ fn what_no_key_of_the_deployer_signed_is_no_part_of_the_next_signature() {
     assert!(text.contains("another manifest than that of revision"), "{text}");
     // One of the same deployer for another id, and none that can be fetched.
     let id = ["--id", "other"];
-    user.has_former(6, "key.pem");
+    user.has_former((6, 1), "key.pem");
     for change in ["/envelopes", "/reported"] {
         let answer = match change {
             "/envelopes" => user.cloud.answer(line),
@@ -261,7 +272,7 @@ fn what_no_key_of_the_deployer_signed_is_no_part_of_the_next_signature() {
     user.cloud.answers("GET /v1/deployments", &[(200, list(json!([other])))]);
     let text = user.fails(3, &[&DEPLOY[..], &id].concat());
     assert!(text.contains("is of another id: `brake`"), "{text}");
-    user.has_former(6, "key.pem");
+    user.has_former((6, 1), "key.pem");
     user.cloud.answers(line, &[(500, super::fake::problem(1, "damaged"))]);
     user.fails(1, &DEPLOY);
     user.done(&chosen);
@@ -270,7 +281,7 @@ fn what_no_key_of_the_deployer_signed_is_no_part_of_the_next_signature() {
 #[test]
 fn a_change_that_takes_something_away_is_asked_for() {
     let user = CloudUser::with_lambda();
-    user.has_former(6, "key.pem");
+    user.has_former((6, 1), "key.pem");
     user.vehicles(&[
         ("car-7", "online", json!({ "site": "berlin" })),
         ("car-8", "online", json!({ "site": "paris" })),
@@ -288,7 +299,7 @@ fn a_change_that_takes_something_away_is_asked_for() {
     user.cloud.answers("GET /v1/deployments", &[(200, list(json!([several])))]);
     let text = user.fails(2, &["remove", "brake", "--fleet"]);
     assert!(text.contains("`brake` is removed from 2 vehicles: car-7, car-8"), "{text}");
-    user.has_former(6, "key.pem");
+    user.has_former((6, 1), "key.pem");
     let changes = |it: &SeenRequest| !it.line.starts_with("GET ");
     assert!(!user.cloud.seen().iter().any(changes), "nothing was sent");
     // The vehicle that loses it is waited for, too.
@@ -361,7 +372,12 @@ fn a_deployment_of_a_fleet_is_listed_changed_and_removed() {
     assert_eq!(words, row);
     let mut stored = in_cloud(6);
     stored["envelope"] = json!("");
+    stored["on_fallback"] = json!(0);
     assert_eq!(user.json(&["fleet"]), json!([stored]));
+    (stored["failed"], stored["on_fallback"]) = (json!(3), json!(2));
+    user.cloud.answers("GET /v1/deployments", &[(200, list(json!([stored])))]);
+    assert!(user.done(&["fleet"]).ends_with(" 3, of which 2 run the fallback\n"));
+    user.cloud.answers("GET /v1/deployments", &[(200, list(json!([in_cloud(6)])))]);
     user.vehicles(&[("car-7", "online", json!({ "site": "berlin" }))]);
     let mut stopped = on_vehicle(6, "running");
     stopped["is_wanted"] = json!(false);
@@ -406,8 +422,9 @@ fn in_waves(release: u64, wave: u64, state: &str, reason: &str) -> Value {
 fn a_deployment_in_waves_sends_its_plan_and_can_be_watched() {
     let user = CloudUser::with_lambda();
     let deployments = |all: &[Value]| {
-        user.has_former(6, "key.pem");
-        let answers = all.iter().map(|it| (200, list(json!([it])))).collect::<Vec<_>>();
+        user.has_former((6, 1), "key.pem");
+        let mut answers = all.iter().map(|it| (200, list(json!([it])))).collect::<Vec<_>>();
+        answers.insert(1, (503, super::fake::problem(5, "lost")));
         user.cloud.answers("GET /v1/deployments", &answers);
     };
     user.vehicles(&[("car-7", "online", json!({ "site": "berlin" }))]);

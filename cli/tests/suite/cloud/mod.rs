@@ -7,7 +7,7 @@ mod vehicles;
 
 use std::fs;
 use std::path::PathBuf;
-use std::process::{Command, Output, Stdio};
+use std::process::Command;
 
 use serde_json::{Value, json};
 use tempfile::TempDir;
@@ -26,7 +26,6 @@ impl CloudUser {
         Self { folder: tempfile::tempdir().unwrap(), cloud: FakeServer::on_tcp() }
     }
 
-    /// A user who has logged in.
     fn logged_in() -> Self {
         let user = Self::new();
         let session = json!({
@@ -44,8 +43,7 @@ impl CloudUser {
     }
 
     fn command(&self, arguments: &[&str]) -> Command {
-        let mut gleaner = Command::new(env!("CARGO_BIN_EXE_gleaner"));
-        gleaner.current_dir(self.folder.path()).args(arguments).stdin(Stdio::null());
+        let mut gleaner = programs::gleaner(self.folder.path(), arguments);
         gleaner.env("XDG_CONFIG_HOME", self.path("config"));
         for variable in ["GLEANER_CLOUD", "GLEANER_CLOUD_TOKEN", "GLEANER_RUN"] {
             gleaner.env_remove(variable);
@@ -67,17 +65,8 @@ impl CloudUser {
     /// Runs a command that must fail with `code`, and returns its message.
     #[track_caller]
     fn fails(&self, code: i32, arguments: &[&str]) -> String {
-        fails(self.command(arguments), code)
+        programs::fails(self.command(arguments), code)
     }
-}
-
-#[track_caller]
-fn fails(mut command: Command, code: i32) -> String {
-    let Output { status, stderr, .. } = programs::output(&mut command);
-    let text = String::from_utf8(stderr).unwrap();
-    assert_eq!(status.code(), Some(code), "{text}");
-    assert!(text.starts_with("error: ") && text.contains("  help:  "), "{text}");
-    text
 }
 
 #[test]
@@ -93,4 +82,9 @@ fn commands_of_the_cloud_itself_are_passed_on_with_their_exit_status() {
         assert_eq!(output.status.code(), Some(7), "{stderr}");
         assert_eq!(String::from_utf8_lossy(&output.stdout), arguments.join(" ") + "\n");
     }
+    // Another program that is missing.
+    let mut play = user.command(&["play", "a.mcap"]);
+    play.env("GLEANER_HOME", &home);
+    let text = programs::fails(play, 1);
+    assert!(text.contains("install the package `gleaner`, which has it; "), "{text}");
 }

@@ -5,9 +5,9 @@ use std::os::unix::fs::PermissionsExt;
 
 use serde_json::{Value, json};
 
+use super::CloudUser;
 use super::fake::problem;
-use super::{CloudUser, fails};
-use crate::programs;
+use crate::programs::{self, fails};
 
 #[test]
 fn a_login_stores_the_token_for_its_user_alone_until_the_logout() {
@@ -42,6 +42,15 @@ fn a_logout_without_the_cloud_forgets_the_token_and_reports_that_it_has_not_ende
     assert!(text.contains("the cloud accepts it until it expires"), "{text}");
     assert!(text.contains("the disk is full"), "{text}");
     assert!(!user.path("config/gleaner/cloud.json").exists());
+}
+
+#[test]
+fn a_logout_with_an_unusable_file_reports_that_the_token_has_not_ended() {
+    let user = CloudUser::logged_in();
+    let file = user.path("config/gleaner/cloud.json");
+    fs::set_permissions(&file, fs::Permissions::from_mode(0o644)).unwrap();
+    let text = user.fails(3, &["logout"]);
+    assert!(text.contains("the cloud accepts it until it expires") && !file.exists(), "{text}");
 }
 
 #[test]

@@ -5,9 +5,9 @@ use std::os::unix::fs::PermissionsExt;
 
 use serde_json::{Value, json};
 
+use super::CloudUser;
 use super::fake::{FakeServer, problem};
-use super::{CloudUser, fails};
-use crate::programs;
+use crate::programs::{self, fails};
 
 /// Returns a status of a vehicle with these deployments.
 pub fn status(deployments: &[Value]) -> Value {
@@ -74,13 +74,86 @@ fn a_vehicle_is_seen_by_way_of_the_cloud() {
     let text = user.done(&["logs", "brake", "--on", "car-7", "-n", "2"]);
     assert_eq!(text.matches("info: hello").count(), 2, "{text}");
     let events = "GET /v1/vehicles/car-7/events?last=100&follow=false";
-    user.cloud.answers(events, &[(200, lines)]);
+    user.cloud.answers(events, &[(200, lines.clone())]);
     assert_eq!(user.json_lines(&["events", "--on", "car-7"]), [line.clone(), line]);
+    user.cloud.answers(&events.replace("false", "true"), &[(200, lines)]);
+    let text = user.fails(5, &["events", "--on", "car-7", "-f"]);
+    assert!(text.contains("the stream has ended"), "{text}");
     let text = user.fails(2, &["status", "--on", "car-8"]);
     assert!(text.contains("no answer to GET /v1/vehicles/car-8/status"), "{text}");
     for bad in [&["status", "--on", "../users"][..], &["status", "--on", "a", "--run-dir", "b"]] {
         assert_eq!(programs::output(&mut user.command(bad)).status.code(), Some(2));
     }
+}
+
+#[test]
+fn listed_events_are_in_the_order_of_boots_and_end_no_line_and_move_no_cursor() {
+    let user = CloudUser::logged_in();
+    let line = |(boot, boot_ns): (&str, u64), time_ns: i64, kind: &str, text: &str| {
+        let record = json!({ "event": kind, "lambda": "a", "text": text, "label": text });
+        json!({
+            "stream": "events", "seq": 1, "time_ns": time_ns, "boot_ns": boot_ns, "boot": boot,
+            "kind": "event", "record": record,
+        })
+    };
+    let hostile = "\u{1b}[2J\u{9b}\u{202e}\nx";
+    let [first, second] = [1_533_199_491_136_000_000, 1_533_199_492_000_000_000];
+    let mut other = line(("b", 3), second, "ready", "");
+    (other["kind"], other["record"]) = (json!("other"), json!(hostile));
+    let mut gap = line(("", 0), 0, "gap", "");
+    (gap["kind"], gap["record"]) = (json!("other"), json!("gap"));
+    // The second start of the machine had an earlier clock.
+    let all = [
+        line(("b", 2), second, "ready", hostile),
+        other.clone(),
+        gap,
+        line(("b", 1), first, "b", "c"),
+        line(("d", 1), 1_000_000_000, "d", "e"),
+    ];
+    let lines = all.map(|line| line.to_string() + "\n").concat();
+    let events = "GET /v1/vehicles/car-7/events?last=100&follow=false";
+    user.cloud.answers(events, &[(200, json!(lines))]);
+    let escaped = r"\u{1b}[2J\u{9b}\u{202e}\nx";
+    // JSON escapes in its own way.
+    let raw = r#"other        "\u001b[2J\u{9b}\u{202e}\nx""#;
+    assert_eq!(
+        user.done(&["events", "--on", "car-7"]),
+        format!(
+            "2018-08-02T08:44:51.136Z b            a: c\n\
+             2018-08-02T08:44:52.000Z ready        a: {escaped}\n2018-08-02T08:44:52.000Z {raw}\n\
+             no time                  other        \"gap\"\n\
+             1970-01-01T00:00:01.000Z d            a: e\n"
+        )
+    );
+    // For programs, they come as they arrived.
+    assert_eq!(user.json_lines(&["events", "--on", "car-7"])[1], other);
+    let mut vehicle = status(&[]);
+    vehicle["vehicle"] = json!(hostile);
+    user.cloud.answers("GET /v1/vehicles/car-7/status", &[(200, vehicle)]);
+    let text = user.done(&["status", "--on", "car-7"]);
+    assert!(text.starts_with(escaped), "{text}");
+    user.cloud.answers("GET /v1/vehicles/car-7/status", &[(404, problem(2, hostile))]);
+    let text = user.fails(2, &["status", "--on", "car-7"]);
+    assert!(text.starts_with(r"error: \u{1b}[2J\u{9b}\u{202e}"), "{text}");
+}
+
+#[test]
+fn logs_of_an_unknown_deployment_are_an_error_that_names_those_that_exist() {
+    let user = CloudUser::logged_in();
+    let known = super::fleet::on_vehicle(1, "running");
+    user.cloud.answers("GET /v1/vehicles/car-7/status", &[(200, status(&[known]))]);
+    for (id, last) in [("nosuch", 1), ("nosuch", 100), ("brake", 100)] {
+        let records = format!("/v1/vehicles/car-7/lambdas/{id}/records?last={last}&follow=false");
+        user.cloud.answers(&format!("GET {records}"), &[(200, json!(""))]);
+    }
+    for follow in
+        [&["logs", "nosuch", "--on", "car-7"][..], &["logs", "nosuch", "-f", "--on", "car-7"]]
+    {
+        let text = user.fails(2, follow);
+        assert!(text.contains("there is no deployment `nosuch`"), "{text}");
+        assert!(text.contains("the deployments are `brake`"), "{text}");
+    }
+    assert_eq!(user.done(&["logs", "brake", "--on", "car-7"]), "");
 }
 
 #[test]
@@ -92,11 +165,11 @@ fn a_vehicle_is_enrolled_once_its_cloud_has_connected() {
         "authority": "PEM", "token": "secret",
     });
     fs::write(user.path("car-7.json"), text.to_string()).unwrap();
-    let with = |address: &str, state: &str, reason: Option<&str>| {
+    let with = |address: &str, state: &str, reason: Option<&str>, help: Option<&str>| {
         let mut status = status(&[]);
         status["cloud"] = json!({
-            "address": address, "state": state, "reason": reason, "since_s": 3.0, "generation": 1,
-            "unsent": 12, "certificate_expires": 4102444800_u64,
+            "address": address, "state": state, "reason": reason, "help": help, "since_s": 3.0,
+            "generation": 1, "unsent": 12, "certificate_expires": 4102444800_u64,
         });
         (200, status)
     };
@@ -106,9 +179,9 @@ fn a_vehicle_is_enrolled_once_its_cloud_has_connected() {
         command
     };
     vehicle.answers("PUT /v1/cloud", &[(200, json!(null))]);
-    let connected = with("10.0.0.1:8443", "connected", None);
-    let former = with("10.0.0.9:8443", "connected", None);
-    let connecting = with("10.0.0.1:8443", "connecting", Some("no route"));
+    let connected = with("10.0.0.1:8443", "connected", None, None);
+    let former = with("10.0.0.9:8443", "connected", None, None);
+    let connecting = with("10.0.0.1:8443", "connecting", Some("no route"), None);
     vehicle.answers("GET /v1/status", &[(200, status(&[])), former, connecting.clone(), connected]);
     let output = programs::output(&mut command(&["enrol", "car-7.json"]));
     let shown = String::from_utf8_lossy(&output.stdout).into_owned();
@@ -121,10 +194,19 @@ fn a_vehicle_is_enrolled_once_its_cloud_has_connected() {
     vehicle.answers("GET /v1/status", &[connecting]);
     let text = fails(command(&["enrol", "car-7.json", "--timeout", "1ms"]), 4);
     assert!(text.contains("after 1ms") && text.contains("cause: no route"), "{text}");
-    let refused = with("10.0.0.1:8443", "refused", Some("the token was used"));
-    vehicle.answers("GET /v1/status", &[refused]);
+    let refused = with("10.0.0.1:8443", "refused", Some("the token was used"), None);
+    vehicle.answers("GET /v1/status", std::slice::from_ref(&refused));
     let text = fails(command(&["enrol", "car-7.json"]), 3);
     assert!(text.contains("cause: the token was used"), "{text}");
+    let reason = Some("the enrolment is not valid: it was used");
+    let helped = with("10.0.0.1:8443", "refused", reason, Some("make another one"));
+    vehicle.answers("GET /v1/status", &[helped]);
+    assert_eq!(
+        fails(command(&["enrol", "car-7.json"]), 3),
+        "error: the cloud at 10.0.0.1:8443 refuses this vehicle\n  cause: the enrolment is not \
+         valid: it was used\n  help:  make another one\n"
+    );
+    vehicle.answers("GET /v1/status", &[refused]);
     let output = programs::output(&mut command(&["status"]));
     assert!(String::from_utf8_lossy(&output.stdout).contains("refused for 3s: the token was used"));
     vehicle.answers("PUT /v1/cloud", &[(400, problem(2, "it is for car-8"))]);

@@ -44,7 +44,6 @@ pub(crate) async fn announce(vehicle: &FakeVehicle, bad: Option<&str>) {
     }
 }
 
-/// Sends all files that the cloud wants.
 pub(crate) async fn send_wanted(vehicle: &FakeVehicle) {
     let orders = report(vehicle, &json!({ "cursor": null, "clips": [], "gone": [] })).await;
     for wanted in orders.wanted {

@@ -52,7 +52,6 @@ pub(crate) struct ClipFiles {
 }
 
 impl ClipFiles {
-    /// Creates the access to a place of files.
     pub(crate) fn new(place: FilePlace, bounds: ClipBounds) -> Self {
         let turns = (0..TURNS).map(|_| Arc::default()).collect();
         Self { place, bounds, parts: AtomicU64::new(0), slots: sync::Mutex::default(), turns }
@@ -240,7 +239,6 @@ fn recording(id: &ClipId) -> String {
     format!("{}.mcap", sha256(id.to_string().as_bytes()))
 }
 
-/// Returns the name of the object with a part of a recording.
 fn part_name(id: &ClipId, number: u64, sha256: &str) -> String {
     format!("{}/{number}-{sha256}", recording(id))
 }

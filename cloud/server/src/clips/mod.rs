@@ -10,6 +10,7 @@ pub(crate) mod people;
 mod tests;
 mod vehicles;
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use gleaner_fleet::clips::ClipId;
@@ -67,24 +68,27 @@ pub(crate) async fn remove_files_of(cloud: &Cloud, id: ClipId) -> CloudResult<bo
     Ok(true)
 }
 
+/// Removes recordings whose parts do not count any more.
+async fn remove_recordings(cloud: &Cloud, ids: &[ClipId]) {
+    for id in ids {
+        let _turn = cloud.clips.turn(id).await;
+        if let Err(error) = cloud.clips.remove_recording(id).await {
+            tracing::warn!(clip = %id, %error, "a file cannot be removed");
+        }
+    }
+}
+
 /// Removes old clips, and unfinished files that are not continued, for as long as the program runs.
-pub(crate) async fn clean(cloud: &Cloud) {
+pub(crate) async fn clean(cloud: Arc<Cloud>) {
     let mut looks = interval(CLEANING);
     loop {
         looks.tick().await;
-        if let Err(error) = remove_expired(cloud).await {
+        if let Err(error) = remove_expired(&cloud).await {
             tracing::warn!(reason = error.reason(), "old clips are not removed");
         }
         let forgotten = cloud.store.forget_unfinished_clips(cloud.clips.bounds.unfinished_s).await;
         match forgotten {
-            Ok(forgotten) => {
-                for id in forgotten {
-                    let _turn = cloud.clips.turn(&id).await;
-                    if let Err(error) = cloud.clips.remove_recording(&id).await {
-                        tracing::warn!(clip = %id, %error, "a file cannot be removed");
-                    }
-                }
-            }
+            Ok(forgotten) => remove_recordings(&cloud, &forgotten).await,
             Err(error) => {
                 tracing::warn!(reason = error.reason(), "unfinished clips are not removed");
             }

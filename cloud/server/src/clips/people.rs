@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use axum::Json;
 use axum::body::Bytes;
-use axum::extract::{Extension, Path, Query, State};
+use axum::extract::{Path, Query, State};
 use axum::http::{HeaderMap, StatusCode};
 use axum::response::Response;
 use gleaner_base::{Exit, Failure};
@@ -13,7 +13,7 @@ use gleaner_fleet::clips::{ClipId, ClipPolicy, ClipState, ClipUsage, FleetClip};
 use gleaner_fleet::people::ListPage;
 
 use super::FileOfClip;
-use crate::cloud::Cloud;
+use crate::cloud::{Call, Cloud};
 use crate::error::{CloudError, CloudResult};
 use crate::request::parsed;
 use crate::store::{ClipQuery, TokenUser};
@@ -35,8 +35,7 @@ pub(crate) async fn show(
 
 /// Marks a clip as wanted. The vehicle sends it when it is connected and has bytes left for today.
 pub(crate) async fn pull(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(actor): Extension<TokenUser>,
+    Call(cloud, actor): Call<TokenUser>,
     Path(id): Path<String>,
 ) -> CloudResult<Json<FleetClip>> {
     let id = parse(&id)?;
@@ -53,8 +52,7 @@ pub(crate) async fn pull(
 
 /// Removes a clip. A kill before its files are removed loses nothing: they go with the next look.
 pub(crate) async fn remove(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(actor): Extension<TokenUser>,
+    Call(cloud, actor): Call<TokenUser>,
     Path(id): Path<String>,
 ) -> CloudResult<StatusCode> {
     let id = parse(&id)?;
@@ -102,8 +100,7 @@ pub(crate) async fn policy(State(cloud): State<Arc<Cloud>>) -> CloudResult<Json<
 }
 
 pub(crate) async fn set_policy(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(actor): Extension<TokenUser>,
+    Call(cloud, actor): Call<TokenUser>,
     body: Bytes,
 ) -> CloudResult<Json<ClipPolicy>> {
     let policy: ClipPolicy = parsed(&body, "policy of clips")?;

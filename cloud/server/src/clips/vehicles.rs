@@ -7,7 +7,7 @@ use std::time::Duration;
 use axum::Json;
 use axum::Router;
 use axum::body::{Body, Bytes};
-use axum::extract::{DefaultBodyLimit, Extension, Path, State};
+use axum::extract::{DefaultBodyLimit, Path};
 use axum::middleware::from_fn;
 use axum::routing::{post, put};
 use futures_util::StreamExt;
@@ -21,7 +21,8 @@ use gleaner_image::Format;
 use gleaner_lambda::manifest::Sha256;
 use tokio::time::timeout;
 
-use crate::cloud::Cloud;
+use super::remove_recordings;
+use crate::cloud::{Call, Cloud};
 use crate::error::{CloudError, CloudResult};
 use crate::request::{digest, in_time, parsed};
 use crate::store::ClipProgress;
@@ -49,8 +50,7 @@ pub(crate) fn router() -> Router<Arc<Cloud>> {
 
 /// Stores a report; answers with everything that is wanted.
 async fn report(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(vehicle): Extension<KnownVehicle>,
+    Call(cloud, vehicle): Call<KnownVehicle>,
     body: Bytes,
 ) -> CloudResult<Json<ClipOrders>> {
     let report: ClipReport = parsed(&body, "report of clips")?;
@@ -72,12 +72,7 @@ async fn report(
     let bounds = cloud.clips.bounds;
     if report != ClipReport::default() {
         let dropped = cloud.store.announce_clips(&vehicle.name, &report, bounds).await?;
-        for id in dropped {
-            let _turn = cloud.clips.turn(&id).await;
-            if let Err(error) = cloud.clips.remove_recording(&id).await {
-                tracing::warn!(clip = %id, %error, "a file cannot be removed");
-            }
-        }
+        remove_recordings(&cloud, &dropped).await;
     }
     orders(&cloud, &vehicle.name).await
 }
@@ -87,8 +82,7 @@ async fn orders(cloud: &Cloud, vehicle: &str) -> CloudResult<Json<ClipOrders>> {
 }
 
 async fn thumbnail(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(vehicle): Extension<KnownVehicle>,
+    Call(cloud, vehicle): Call<KnownVehicle>,
     Path(name): Path<String>,
     body: Bytes,
 ) -> CloudResult<Json<ClipOrders>> {
@@ -129,8 +123,7 @@ pub(crate) fn is_thumbnail(bytes: &[u8]) -> bool {
 
 /// Receives a part. One that was received before changes nothing.
 async fn part(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(vehicle): Extension<KnownVehicle>,
+    Call(cloud, vehicle): Call<KnownVehicle>,
     Path((name, number, sha256)): Path<(String, u64, String)>,
     body: Body,
 ) -> CloudResult<Json<ClipOrders>> {

@@ -1,8 +1,6 @@
 //! Access: users and vehicles are invited and removed.
 
-use std::sync::Arc;
-
-use axum::extract::{Extension, Path, Query, State};
+use axum::extract::{Extension, Path, Query};
 use axum::http::header;
 use axum::response::{IntoResponse, Redirect};
 use gleaner_fleet::people::{NewUser, Role, User, VehicleState};
@@ -10,12 +8,12 @@ use maud::{Markup, html};
 use serde::Deserialize;
 
 use super::guard::FormFields;
-use super::layout::{self, PageResult, confirmed, done, failure, form, with_status};
-use super::session::PageUser;
+use super::layout::{self, PageResult, confirmed, done, failure, form, parts, with_status};
+use super::session::{Call, PageUser, Visit};
 use super::text::{query, segment, shown, time, vehicle_path};
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
-use crate::people::enrolment;
+use crate::people::{self, enrolment};
 use crate::store::VehicleFilter;
 
 /// Number of users and of vehicles on a page.
@@ -38,11 +36,7 @@ pub(super) struct AccessQuery {
     vehicles: usize,
 }
 
-pub(super) async fn page(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
-    Query(asked): Query<AccessQuery>,
-) -> PageResult {
+pub(super) async fn page(Call(cloud, user): Visit, Query(asked): Query<AccessQuery>) -> PageResult {
     let message = done(asked.done.as_deref());
     access_page(&cloud, &user, &asked, message).await
 }
@@ -153,19 +147,11 @@ async fn vehicles(cloud: &Cloud, user: &PageUser, asked: &AccessQuery) -> CloudR
 
 fn pages(list: &str, index: usize, total: usize) -> Markup {
     let address = |page: usize| format!("/access{}#{list}", query(&[(list, &page.to_string())]));
-    html! {
-        @if index > 0 || (index + 1) * SIZE < total {
-            nav.pages aria-label=(format!("Parts of the list of {list}")) {
-                @if index > 0 { a href=(address(index - 1)) { "Previous" } }
-                @if (index + 1) * SIZE < total { a href=(address(index + 1)) { "Next" } }
-            }
-        }
-    }
+    parts(list, index, (SIZE, total), address)
 }
 
 pub(super) async fn invite(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
+    Call(cloud, user): Visit,
     Extension(fields): Extension<FormFields>,
 ) -> PageResult {
     let invited = async {
@@ -183,7 +169,7 @@ pub(super) async fn invite(
             p { "Pass on this code, in private. It is not shown again." }
             p.code { code id="invitation" { (invitation.code) } }
             p { "It works once, until "
-                (time(i64::try_from(invitation.expires).unwrap_or(i64::MAX)))
+                (time(invitation.expires))
                 ": on the page under " code { "/login" } ", or with "
                 code { "gleaner login URL --code CODE" } "." }
         }
@@ -197,19 +183,13 @@ async fn refused(cloud: &Cloud, user: &PageUser, error: CloudError) -> PageResul
     Ok(with_status(status, page))
 }
 
-pub(super) async fn remove_user(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
-    Path(name): Path<String>,
-) -> PageResult {
-    cloud.store.remove_user(&user.user.name, &name).await?;
-    cloud.readers.end(&name);
+pub(super) async fn remove_user(Call(cloud, user): Visit, Path(name): Path<String>) -> PageResult {
+    people::remove_user(Call(cloud, user.token_user()), Path(name)).await?;
     Ok(Redirect::to("/access?done=user").into_response())
 }
 
 pub(super) async fn enrol(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
+    Call(cloud, user): Visit,
     Extension(fields): Extension<FormFields>,
 ) -> PageResult {
     let name = fields.get("name").trim();
@@ -227,12 +207,7 @@ pub(super) async fn enrol(
     Ok((headers, text).into_response())
 }
 
-pub(super) async fn cut_off(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
-    Path(name): Path<String>,
-) -> PageResult {
-    cloud.store.revoke(&user.user.name, &name).await?;
-    cloud.hub.end(&name, "the vehicle was cut off");
+pub(super) async fn cut_off(Call(cloud, user): Visit, Path(name): Path<String>) -> PageResult {
+    people::revoke(Call(cloud, user.token_user()), Path(name)).await?;
     Ok(Redirect::to("/access?done=vehicle").into_response())
 }

@@ -1,8 +1,6 @@
 //! The account of a user: the password, and the tokens for programs.
 
-use std::sync::Arc;
-
-use axum::extract::{Extension, Path, Query, State};
+use axum::extract::{Extension, Path, Query};
 use axum::response::{IntoResponse, Redirect};
 use gleaner_fleet::people::{NewToken, TOKEN_DAYS_MAX, TokenSummary};
 use maud::{Markup, html};
@@ -12,10 +10,11 @@ use super::access::ROLES;
 use super::guard::FormFields;
 use super::layout::{self, PageResult, confirmed, done, failure, form, with_status};
 use super::password;
-use super::session::PageUser;
+use super::session::{Call, PageUser, Visit};
 use super::text::{segment, shown, time};
 use crate::cloud::Cloud;
 use crate::error::CloudError;
+use crate::people::tokens;
 use crate::store::TOKENS_MAX;
 
 /// The change that was made before a page is shown.
@@ -24,11 +23,7 @@ pub(super) struct Done {
     pub(super) done: Option<String>,
 }
 
-pub(super) async fn page(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
-    Query(query): Query<Done>,
-) -> PageResult {
+pub(super) async fn page(Call(cloud, user): Visit, Query(query): Query<Done>) -> PageResult {
     account_page(&cloud, &user, done(query.done.as_deref())).await
 }
 
@@ -60,8 +55,7 @@ async fn account_page(cloud: &Cloud, user: &PageUser, message: Markup) -> PageRe
 }
 
 pub(super) async fn set_password(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
+    Call(cloud, user): Visit,
     Extension(fields): Extension<FormFields>,
 ) -> PageResult {
     let new = fields.get("password");
@@ -95,7 +89,7 @@ fn tokens(user: &PageUser, all: &[TokenSummary]) -> Markup {
             ul.rows { @for it in all {
                 li.card {
                     span { b { (shown(&it.name)) } " " span.dim { (it.role) ", until "
-                        (time(i64::try_from(it.expires).unwrap_or(i64::MAX))) } }
+                        (time(it.expires)) } }
                     (confirmed(user, &format!("/account/tokens/{}/remove", segment(&it.name)),
                         "Remove", &format!("Programs that use {} are refused at once.", it.name),
                         html! {}))
@@ -128,8 +122,7 @@ fn tokens(user: &PageUser, all: &[TokenSummary]) -> Markup {
 }
 
 pub(super) async fn make_token(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
+    Call(cloud, user): Visit,
     Extension(fields): Extension<FormFields>,
 ) -> PageResult {
     let made = async {
@@ -152,7 +145,7 @@ pub(super) async fn make_token(
             p { "Copy this token now. It is not shown again." }
             p.code { code { (made.token) } }
             p { "It has the role " (made.user.role) ", until "
-                (time(i64::try_from(made.expires).unwrap_or(i64::MAX)))
+                (time(made.expires))
                 ". Programs have it as " code { "GLEANER_CLOUD_TOKEN" } ", with the address of \
                 the cloud as " code { "GLEANER_CLOUD" } "." }
         }
@@ -160,12 +153,8 @@ pub(super) async fn make_token(
     Ok(layout::page("Token", "/account", Some(&user), body))
 }
 
-pub(super) async fn remove_token(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
-    Path(name): Path<String>,
-) -> PageResult {
-    cloud.store.remove_token(&user.user.name, &user.user.name, &name).await?;
-    cloud.readers.end(&user.user.name);
+pub(super) async fn remove_token(Call(cloud, user): Visit, Path(name): Path<String>) -> PageResult {
+    let token = Path((user.user.name.clone(), name));
+    tokens::remove(Call(cloud, user.token_user()), token).await?;
     Ok(Redirect::to("/account?done=token").into_response())
 }

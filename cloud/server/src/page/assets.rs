@@ -20,7 +20,6 @@ pub(super) fn address(name: &str) -> String {
     format!("/assets/{name}?{}", env!("CARGO_PKG_VERSION"))
 }
 
-/// Answers with a file.
 pub(super) async fn file(Path(name): Path<String>) -> Response {
     let Some((_, kind, content)) = FILES.iter().find(|(known, _, _)| *known == name) else {
         return CloudError::missing("there is no such file", "open the start page").into_response();

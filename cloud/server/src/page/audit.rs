@@ -1,15 +1,12 @@
 //! The audit trail: who changed what.
 
-use std::sync::Arc;
-
-use axum::extract::{Extension, Query, State};
+use axum::extract::Query;
 use maud::html;
 use serde::Deserialize;
 
 use super::layout::{self, PageResult, empty};
-use super::session::PageUser;
+use super::session::{Call, Visit};
 use super::text::{query, short, shown, time};
-use crate::cloud::Cloud;
 
 /// Number of entries on a page.
 const SIZE: u64 = 50;
@@ -20,11 +17,7 @@ pub(super) struct AuditPart {
     before: Option<u64>,
 }
 
-pub(super) async fn page(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
-    Query(part): Query<AuditPart>,
-) -> PageResult {
+pub(super) async fn page(Call(cloud, user): Visit, Query(part): Query<AuditPart>) -> PageResult {
     let entries = cloud.store.audit(part.before.unwrap_or(u64::MAX), SIZE).await?;
     let body = html! {
         h1 { "Audit trail" }

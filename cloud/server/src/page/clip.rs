@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use axum::extract::{Extension, Path, Query, State};
+use axum::extract::{Path, Query, State};
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Redirect};
 use gleaner_fleet::clips::{
@@ -16,12 +16,11 @@ use super::charts;
 use super::clips::{clip_path, image, length, state, title};
 use super::layout::{self, PageResult, done, form};
 use super::recording::{self, Recording, TOPICS_MAX, whole};
-use super::session::PageUser;
+use super::session::{Call, PageUser, Visit};
 use super::text::{self, bytes, count, moment, segment, shown, vehicle_path};
 use crate::clips::{is_thumbnail, people};
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
-use crate::store::TokenUser;
 
 /// The image in the place of a thumbnail that is lost or damaged: a page has no broken image.
 const NO_IMAGE: &str = r##"<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 160 90">
@@ -31,8 +30,7 @@ font-family="sans-serif" font-size="12" fill="#888">no image</text></svg>"##;
 const ATTRIBUTES_MAX: usize = 16;
 
 pub(super) async fn page(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
+    Call(cloud, user): Visit,
     Path(id): Path<String>,
     Query(query): Query<Done>,
 ) -> PageResult {
@@ -112,14 +110,9 @@ pub(super) async fn file(
 }
 
 /// Marks the file as wanted.
-pub(super) async fn pull(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
-    Path(id): Path<String>,
-) -> PageResult {
+pub(super) async fn pull(Call(cloud, user): Visit, Path(id): Path<String>) -> PageResult {
     let here = clip_path(&parse(&id)?);
-    let user = TokenUser::new(user.user, String::new());
-    let _ = people::pull(State(cloud), Extension(user), Path(id)).await?;
+    let _ = people::pull(Call(cloud, user.token_user()), Path(id)).await?;
     Ok(Redirect::to(&format!("{here}?done=clip")).into_response())
 }
 

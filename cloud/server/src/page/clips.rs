@@ -1,16 +1,13 @@
 //! Clips of the fleet: their list, and those of a time line, each with its thumbnail.
 
-use std::sync::Arc;
-
-use axum::extract::{Extension, Query, State};
+use axum::extract::Query;
 use gleaner_fleet::clips::{ClipId, ClipState, FleetClip};
 use maud::{Markup, html};
 use serde::Deserialize;
 
 use super::layout::{self, PageResult, empty};
-use super::session::PageUser;
+use super::session::{Call, Visit};
 use super::text::{bytes, moment, query, segment, shown};
-use crate::cloud::Cloud;
 use crate::request::PageLimit;
 use crate::store::ClipQuery;
 
@@ -54,11 +51,7 @@ impl ClipPart {
     }
 }
 
-pub(super) async fn page(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
-    Query(part): Query<ClipPart>,
-) -> PageResult {
+pub(super) async fn page(Call(cloud, user): Visit, Query(part): Query<ClipPart>) -> PageResult {
     let found = cloud.store.clips(&part.clips()).await?;
     let here = part.address(part.after);
     let next = found.next.as_ref().and_then(|next| next.parse().ok());
@@ -175,7 +168,6 @@ pub(super) fn state(clip: &FleetClip) -> Markup {
     html! { span class={ "state " (class) } { (words) } }
 }
 
-/// Returns the path of a clip's page.
 pub(super) fn clip_path(id: &ClipId) -> String {
     format!("/clips/{}", segment(&id.to_string()))
 }

@@ -1,9 +1,8 @@
 //! Deployments of the fleet, their progress, and their changes. None of them needs a key: what runs
 //! was signed elsewhere.
 
-use std::sync::Arc;
-
-use axum::extract::{Extension, Path, Query, State};
+use axum::extract::{Path, Query};
+use axum::http::HeaderMap;
 use axum::response::{IntoResponse, Redirect};
 use gleaner_fleet::people::{FleetDeployment, Role};
 use gleaner_fleet::waves::{WaveProgress, WaveState};
@@ -12,19 +11,14 @@ use maud::{Markup, html};
 use super::account::Done;
 use super::charts;
 use super::layout::{self, PageResult, confirmed, done, empty, form};
-use super::session::PageUser;
+use super::session::{Call, PageUser, Visit};
 use super::text::{count, deployment_path, label, segment, short, shown, vehicle_path};
-use crate::cloud::Cloud;
-use crate::people::change_deployment;
+use crate::people::{self, change_deployment};
 
 /// Maximum number of vehicles that are listed with a deployment.
 const VEHICLES_MAX: i64 = 100;
 
-pub(super) async fn list(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
-    Query(query): Query<Done>,
-) -> PageResult {
+pub(super) async fn list(Call(cloud, user): Visit, Query(query): Query<Done>) -> PageResult {
     let all = cloud.store.deployments("", u64::MAX).await?;
     let body = html! {
         h1 { "Deployments" }
@@ -50,8 +44,7 @@ pub(super) async fn list(
 }
 
 pub(super) async fn page(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
+    Call(cloud, user): Visit,
     Path(id): Path<String>,
     Query(query): Query<Done>,
 ) -> PageResult {
@@ -85,7 +78,7 @@ fn wish(deployment: &FleetDeployment) -> Markup {
 
 /// Renders how many of its vehicles run it.
 fn progress(deployment: &FleetDeployment) -> Markup {
-    let FleetDeployment { vehicles, running, failed, .. } = *deployment;
+    let FleetDeployment { vehicles, running, failed, on_fallback, .. } = *deployment;
     let others = vehicles.saturating_sub(running).saturating_sub(failed);
     let rest = if deployment.is_wanted { "to come" } else { "not running" };
     html! {
@@ -93,7 +86,8 @@ fn progress(deployment: &FleetDeployment) -> Markup {
         @else {
             (charts::parts("Vehicles", &[
                 ("running", "running", running),
-                ("failed", "failed or refused", failed),
+                ("failed", "failed or refused", failed.saturating_sub(on_fallback)),
+                ("waiting", "run the fallback", on_fallback),
                 ("other", rest, others),
             ]))
         }
@@ -137,6 +131,7 @@ fn vehicles(reports: &[(String, String, String)]) -> Markup {
                         @let (class, text) = match &**state {
                             "running" => ("running", "running"),
                             "failed" => ("failed", "failed or refused"),
+                            "fallback" => ("waiting", "runs its fallback"),
                             "pending" => ("waiting", "not fetched yet"),
                             _ => ("other", "not running"),
                         };
@@ -233,8 +228,7 @@ fn changes(user: &PageUser, here: &str, deployment: &FleetDeployment) -> Markup 
 }
 
 pub(super) async fn change(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
+    Call(cloud, user): Visit,
     Path((id, change)): Path<(String, String)>,
 ) -> PageResult {
     change_deployment(&cloud, &user.user, &id, &change).await?;
@@ -243,12 +237,8 @@ pub(super) async fn change(
     Ok(Redirect::to(&to).into_response())
 }
 
-pub(super) async fn remove(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
-    Path(id): Path<String>,
-) -> PageResult {
-    let changed = cloud.store.remove_deployment(&user.user.name, &id).await?;
-    cloud.hub.wake(&changed);
+pub(super) async fn remove(Call(cloud, user): Visit, Path(id): Path<String>) -> PageResult {
+    let any = HeaderMap::new();
+    people::remove_deployment(Call(cloud, user.token_user()), Path(id), any).await?;
     Ok(Redirect::to("/deployments?done=deployment").into_response())
 }

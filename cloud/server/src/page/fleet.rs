@@ -1,18 +1,15 @@
 //! The fleet: all vehicles, with filters.
 
-use std::sync::Arc;
-
-use axum::extract::{Extension, Query, State};
+use axum::extract::Query;
 use axum::response::{IntoResponse, Redirect, Response};
 use gleaner_fleet::people::{VehicleState, VehicleSummary};
 use maud::{Markup, html};
 use serde::Deserialize;
 
 use super::charts;
-use super::layout::{self, PageResult, empty};
-use super::session::PageUser;
+use super::layout::{self, PageResult, empty, parts};
+use super::session::{Call, Visit};
 use super::text::{ago, count, label, query, shown, vehicle_path};
-use crate::cloud::Cloud;
 use crate::store::{VehicleFilter, VehiclePage};
 
 /// Number of vehicles on a page.
@@ -72,8 +69,7 @@ pub(super) async fn start() -> Response {
 }
 
 pub(super) async fn page(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
+    Call(cloud, user): Visit,
     Query(mut asked): Query<FleetQuery>,
 ) -> PageResult {
     asked.page = asked.page.min(1_000_000);
@@ -159,14 +155,7 @@ fn list(asked: &FleetQuery, found: &VehiclePage) -> Markup {
                 }
             }
         }
-        @if asked.page > 0 || last < found.found {
-            nav.pages aria-label="Parts of the list" {
-                @if asked.page > 0 {
-                    a id="previous" href=(asked.address(asked.page - 1)) { "Previous" } }
-                @if last < found.found {
-                    a id="next" href=(asked.address(asked.page + 1)) { "Next" } }
-            }
-        }
+        (parts("vehicles", asked.page, (SIZE, found.found), |page| asked.address(page)))
     }
 }
 

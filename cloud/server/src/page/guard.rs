@@ -15,7 +15,6 @@ use super::session::{PageUser, check_origin};
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 
-/// Maximum length of a form.
 pub(super) const FORM_MAX: usize = 16 << 10;
 
 /// Scripts, styles and pictures come from this program only, and no other site can frame a page.
@@ -39,7 +38,6 @@ const HEADERS: [(HeaderName, &str); 6] = [
 pub(super) struct FormFields(HashMap<String, String>);
 
 impl FormFields {
-    /// Returns the role in the field `role`.
     pub(super) fn role(&self) -> CloudResult<Role> {
         self.get("role").parse().map_err(|error: String| {
             CloudError::usage("the role is not known", "choose one of the list").because(error)

@@ -1,16 +1,15 @@
 //! Lambdas of the fleet, by the revisions that deployments name.
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
 
-use axum::extract::{Extension, Path, Query, State};
+use axum::extract::{Path, Query};
 use gleaner_fleet::people::FleetDeployment;
 use gleaner_trust::{Revision, unverified_revision};
 use maud::{Markup, html};
 use serde::Deserialize;
 
-use super::layout::{self, PageResult, empty};
-use super::session::PageUser;
+use super::layout::{self, PageResult, empty, parts};
+use super::session::{Call, Visit};
 use super::text::{bytes, count, deployment_path, query, segment, short, shown, time};
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
@@ -47,11 +46,7 @@ async fn parsed(cloud: &Cloud, digest: &str) -> CloudResult<Option<Revision>> {
     Ok(envelope.and_then(|text| unverified_revision(text.as_bytes()).ok()).map(|(it, _)| it))
 }
 
-pub(super) async fn page(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
-    Query(part): Query<LambdaPart>,
-) -> PageResult {
+pub(super) async fn page(Call(cloud, user): Visit, Query(part): Query<LambdaPart>) -> PageResult {
     let uses = uses(&cloud).await?;
     let index = part.page.min(1_000_000);
     let mut rows = Vec::new();
@@ -76,12 +71,7 @@ pub(super) async fn page(
                 }
             }
         }
-        @if index > 0 || (index + 1) * SIZE < uses.len() {
-            nav.pages aria-label="Parts of the list" {
-                @if index > 0 { a href=(address(index - 1)) { "Previous" } }
-                @if (index + 1) * SIZE < uses.len() { a href=(address(index + 1)) { "Next" } }
-            }
-        }
+        (parts("revisions", index, (SIZE, uses.len()), address))
     };
     Ok(layout::page("Lambdas", "/lambdas", Some(&user), body))
 }
@@ -100,13 +90,9 @@ fn row(digest: &str, used: &(Vec<String>, Vec<String>), revision: Option<&Revisi
             td { a href=(format!("/lambdas/{}", segment(digest))) { code { (short(digest)) } }
                 @if let Some(it) = revision { " " span.dim { "release " (it.release) } } }
             td { (links(used)) }
-            td.optional { @if let Some(it) = revision { (signed(it)) } }
+            td.optional { @if let Some(it) = revision { (time(it.created)) } }
         }
     }
-}
-
-fn signed(revision: &Revision) -> Markup {
-    time(i64::try_from(revision.created).unwrap_or(i64::MAX))
 }
 
 fn links((current, fallbacks): &(Vec<String>, Vec<String>)) -> Markup {
@@ -120,11 +106,7 @@ fn links((current, fallbacks): &(Vec<String>, Vec<String>)) -> Markup {
     }
 }
 
-pub(super) async fn revision(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
-    Path(digest): Path<String>,
-) -> PageResult {
+pub(super) async fn revision(Call(cloud, user): Visit, Path(digest): Path<String>) -> PageResult {
     let missing = || CloudError::missing("there is no such revision", "choose one from the list");
     let revision = parsed(&cloud, &digest).await?.ok_or_else(missing)?;
     let used = uses(&cloud).await?.remove(&digest).unwrap_or_default();
@@ -137,7 +119,7 @@ pub(super) async fn revision(
             dl {
                 dt { "Revision" } dd { code { (shown(&digest)) } }
                 dt { "Release" } dd { (revision.release) }
-                dt { "Signed" } dd { (signed(&revision)) }
+                dt { "Signed" } dd { (time(revision.created)) }
                 dt { "Deployments" } dd { (links(&used)) }
             }
         }

@@ -201,6 +201,27 @@ pub(super) fn empty(text: &str) -> Markup {
     html! { p.empty { (text) } }
 }
 
+/// Renders links to the parts before and after the part `index` of a list with `total` entries, of
+/// which each part has `size`. `address` returns the address of a part.
+pub(super) fn parts(
+    name: &str,
+    index: usize,
+    (size, total): (usize, usize),
+    address: impl Fn(usize) -> String,
+) -> Markup {
+    let has_next = (index + 1) * size < total;
+    html! {
+        @if index > 0 || has_next {
+            nav.pages aria-label=(format!("Parts of the list of {name}")) {
+                @if index > 0 {
+                    a id=(format!("{name}-before")) href=(address(index - 1)) { "Previous" } }
+                @if has_next {
+                    a id=(format!("{name}-after")) href=(address(index + 1)) { "Next" } }
+            }
+        }
+    }
+}
+
 /// Returns a page with a status other than 200.
 pub(super) fn with_status(status: StatusCode, page: Response) -> Response {
     (status, page).into_response()

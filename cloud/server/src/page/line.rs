@@ -39,15 +39,6 @@ pub(super) fn line(text: &str, has_stream: bool) -> Markup {
     }
 }
 
-/// Returns the time of a record, in ns since 1970, if it has one.
-pub(super) fn time_ns(text: &str) -> Option<i64> {
-    #[derive(serde::Deserialize)]
-    struct TimeOfLine {
-        time_ns: i64,
-    }
-    serde_json::from_str::<TimeOfLine>(text).ok().map(|it| it.time_ns).filter(|time| *time != 0)
-}
-
 /// Returns whether a record belongs to the time line of its vehicle: all but log lines do.
 pub(super) fn is_of_time_line(text: &str) -> bool {
     #[derive(serde::Deserialize)]

@@ -10,7 +10,7 @@ use maud::{Markup, html};
 use super::guard::FormFields;
 use super::layout::{self, PageResult, failure, with_status};
 use super::password;
-use super::session::{PageUser, session_of, set_cookie};
+use super::session::{Call, PageUser, Visit, session_of, set_cookie};
 use crate::clients::ClientNetwork;
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
@@ -128,11 +128,7 @@ async fn enter(cloud: &Cloud, headers: &HeaderMap, session: &str, to: &str) -> P
     Ok(([(header::SET_COOKIE, cookie)], Redirect::to(to)).into_response())
 }
 
-pub(super) async fn logout(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
-    headers: HeaderMap,
-) -> PageResult {
+pub(super) async fn logout(Call(cloud, user): Visit, headers: HeaderMap) -> PageResult {
     cloud.store.close_session(user.session()).await?;
     let cookie = set_cookie(&headers, None);
     Ok(([(header::SET_COOKIE, cookie)], Redirect::to("/login")).into_response())

@@ -81,10 +81,10 @@ pub(crate) fn routes() -> Vec<PageRoute> {
         read("/vehicles", Viewer, get(fleet::page)),
         read("/vehicles/{name}", Viewer, get(vehicle::page)),
         send("/vehicles/{name}/agree", Admin, post(vehicle::agree)),
-        read("/vehicles/{name}/events", Viewer, get(records::time_line)),
-        read("/vehicles/{name}/events/stream", Viewer, get(stream::time_line)),
-        read("/vehicles/{name}/lambdas/{id}", Viewer, get(records::lambda)),
-        read("/vehicles/{name}/lambdas/{id}/stream", Viewer, get(stream::lambda)),
+        read("/vehicles/{name}/events", Viewer, get(records::page)),
+        read("/vehicles/{name}/events/stream", Viewer, get(stream::follow)),
+        read("/vehicles/{name}/lambdas/{id}", Viewer, get(records::page)),
+        read("/vehicles/{name}/lambdas/{id}/stream", Viewer, get(stream::follow)),
         read("/clips", Viewer, get(clips::page)),
         read("/clips/{id}", Viewer, get(clip::page)),
         read("/clips/{id}/thumbnail", Viewer, get(clip::thumbnail)),
@@ -105,7 +105,6 @@ pub(crate) fn routes() -> Vec<PageRoute> {
     ]
 }
 
-/// Returns the routes.
 pub(crate) fn router(cloud: &Arc<Cloud>) -> Router<Arc<Cloud>> {
     let mut router = Router::new();
     for PageRoute { path, role, handler, .. } in routes() {

@@ -17,7 +17,6 @@ use crate::error::CloudResult;
 
 /// Number of bytes at the end of a file that are read: summaries take some KiB.
 const TAIL_MAX: u64 = 1 << 20;
-/// Maximum number of topics that are returned.
 pub(super) const TOPICS_MAX: usize = 200;
 /// Bytes of the record at the end of a file, with its head, and of the magic number after it.
 const FOOTER: usize = 29;
@@ -35,7 +34,6 @@ pub(super) struct Recording {
     pub(super) omitted: usize,
 }
 
-/// A topic of a stored clip.
 #[derive(Debug, PartialEq)]
 pub(super) struct StoredTopic {
     pub(super) name: String,

@@ -1,21 +1,20 @@
 //! The time line of a vehicle, and the records of one lambda: the newest first, followed by a
 //! stream.
 
-use std::sync::Arc;
-
-use axum::extract::{Extension, Path, Query, State};
+use axum::extract::{Path, Query};
 use maud::{Markup, html};
 use serde::Deserialize;
 
 use super::clips;
 use super::layout::{self, PageResult, empty};
-use super::line::{line, time_ns};
+use super::line::line;
 use super::search::SearchPart;
-use super::session::PageUser;
+use super::session::{Call, Visit};
 use super::text::{query, segment, shown, vehicle_path};
 use super::vehicle::find;
 use crate::cloud::Cloud;
 use crate::error::CloudResult;
+use crate::records::{in_time_order, time_ns};
 use crate::request::PageLimit;
 use crate::store::{ClipQuery, NewestRecords};
 
@@ -26,10 +25,13 @@ const READ: usize = 1000;
 /// Maximum number of clips above a time line.
 const CLIPS: PageLimit = PageLimit::of(12);
 
-#[derive(Debug, Clone)]
+/// The records that a path names.
+#[derive(Debug, Clone, Deserialize)]
 pub(super) struct RecordSource {
+    #[serde(rename = "name")]
     pub(super) vehicle: String,
     /// Id of the deployment whose lambda has them; without one, the time line of the vehicle.
+    #[serde(rename = "id")]
     pub(super) lambda: Option<String>,
 }
 
@@ -70,8 +72,13 @@ impl RecordSource {
         }
     }
 
-    pub(super) fn line(&self, text: &str) -> Markup {
-        line(text, self.lambda.is_none())
+    /// Renders lines that came the newest first, those of several streams by their times.
+    pub(super) fn lines<L: AsRef<str>>(
+        &self,
+        newest_first: impl DoubleEndedIterator<Item = L>,
+    ) -> Markup {
+        let lines = in_time_order(newest_first.rev());
+        html! { @for text in lines.iter().rev() { (line(text.as_ref(), self.lambda.is_none())) } }
     }
 
     fn path(&self) -> String {
@@ -83,57 +90,22 @@ impl RecordSource {
     }
 }
 
-pub(super) async fn time_line(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
-    Path(vehicle): Path<String>,
-    Query(part): Query<RecordPart>,
+pub(super) async fn page(
+    Call(cloud, user): Visit,
+    Path(source): Path<RecordSource>,
+    Query(RecordPart { before, search }): Query<RecordPart>,
 ) -> PageResult {
-    page(&cloud, &user, RecordSource { vehicle, lambda: None }, &part).await
-}
-
-pub(super) async fn lambda(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
-    Path((vehicle, id)): Path<(String, String)>,
-    Query(part): Query<RecordPart>,
-) -> PageResult {
-    page(&cloud, &user, RecordSource { vehicle, lambda: Some(id) }, &part).await
-}
-
-async fn page(
-    cloud: &Cloud,
-    user: &PageUser,
-    source: RecordSource,
-    part: &RecordPart,
-) -> PageResult {
-    let vehicle = find(cloud, &source.vehicle).await?;
+    let vehicle = find(&cloud, &source.vehicle).await?;
     // Reading takes memory.
     let _slot = cloud.page_readers.open(&user.user.name)?;
-    let RecordPart { before, search } = part;
-    if search.is_search() {
-        let here = source.path();
-        let title = source.lambda.as_deref().map_or("Time line".to_owned(), shown);
-        let title = format!("Search in {title} of {}", shown(&vehicle.name));
-        let body = html! {
-            nav.crumbs aria-label="Path" {
-                a href="/vehicles" { "Fleet" } " / "
-                a href=(vehicle_path(&vehicle.name)) { (shown(&vehicle.name)) }
-            }
-            h1 { (title) }
-            (search.form(&here))
-            (search.found(cloud, &source, &here).await?)
-        };
-        return Ok(layout::page(&title, "/vehicles", Some(user), body));
-    }
-    let newest = source.newest(cloud, (0, before.unwrap_or(i64::MAX)), SIZE).await?;
-    let clips = match source.lambda {
-        None => clips_of(cloud, &source.vehicle, before.is_some(), &newest).await?,
-        Some(_) => html! {},
+    let (here, up) = (source.path(), vehicle_path(&vehicle.name));
+    let is_search = search.is_search();
+    let records = match is_search {
+        true => search.found(&cloud, &source, &here).await?,
+        false => newest_before(&cloud, &source, &here, before).await?,
     };
-    let here = source.path();
-    let up = vehicle_path(&vehicle.name);
     let title = source.lambda.as_deref().map_or("Time line".to_owned(), shown);
+    let title = if is_search { format!("Search in {title}") } else { title };
     let body = html! {
         nav.crumbs aria-label="Path" {
             a href="/vehicles" { "Fleet" } " / " a href=(up) { (shown(&vehicle.name)) }
@@ -146,30 +118,52 @@ async fn page(
             }
             p.help { "Clips, events and triggers, the newest first; times are in UTC. Log lines \
                       are with their lambda." }
-            div id="clips" hx-get=[before.is_none().then_some(&here)]
-                hx-trigger=[before.is_none().then_some("every 10s")]
-                hx-select="#clips" hx-swap="outerHTML" {
-                (clips)
-            }
         } @else {
             p.help { "Log lines, triggers, starts and ends, the newest first; times are in UTC." }
         }
         (search.form(&here))
-        @if before.is_none() {
-            (followed(&source, &here, &newest))
+        (records)
+    };
+    let title = format!("{title} of {}", vehicle.name);
+    Ok(layout::page(&title, "/vehicles", Some(&user), body))
+}
+
+/// Renders the newest records, or those that came before others.
+async fn newest_before(
+    cloud: &Cloud,
+    source: &RecordSource,
+    here: &str,
+    before: Option<i64>,
+) -> CloudResult<Markup> {
+    let newest = source.newest(cloud, (0, before.unwrap_or(i64::MAX)), SIZE).await?;
+    let is_newest = before.is_none();
+    let clips = match source.lambda {
+        None => clips_of(cloud, &source.vehicle, !is_newest, &newest).await?,
+        Some(_) => html! {},
+    };
+    Ok(html! {
+        @if source.lambda.is_none() {
+            div id="clips" hx-get=[is_newest.then_some(here)]
+                hx-trigger=[is_newest.then_some("every 10s")]
+                hx-select="#clips" hx-swap="outerHTML" {
+                (clips)
+            }
+        }
+        @if is_newest {
+            (followed(source, here, &newest))
         } @else {
             p { a href=(here) { "Go to the newest" } }
-            (lines(&source, &newest))
+            div.lines role="region" aria-label="Records" tabindex="0" {
+                (source.lines(newest.texts()))
+            }
+            @if newest.lines.is_empty() { (empty("There are no older ones.")) }
         }
-        @if newest.lines.is_empty() && before.is_some() { (empty("There are no older ones.")) }
         @if let Some(before) = older(&newest) {
             nav.pages aria-label="Parts of the list" {
                 a href=(format!("{here}{}", query(&[("before", &before.to_string())]))) { "Older" }
             }
         }
-    };
-    let title = format!("{title} of {}", vehicle.name);
-    Ok(layout::page(&title, "/vehicles", Some(user), body))
+    })
 }
 
 /// Renders the clips of the time that these records are of; without an end, if they are the newest.
@@ -179,7 +173,7 @@ async fn clips_of(
     has_end: bool,
     newest: &NewestRecords,
 ) -> CloudResult<Markup> {
-    let times = || newest.lines.iter().filter_map(|(_, line)| time_ns(line));
+    let times = || newest.texts().filter_map(time_ns);
     let query = ClipQuery {
         vehicle: Some(vehicle.to_owned()),
         // Without older records, all clips from before are of this part.
@@ -217,17 +211,9 @@ fn followed(source: &RecordSource, here: &str, newest: &NewestRecords) -> Markup
             }
             div.lines role="log" aria-label="Records" aria-live="polite" tabindex="0"
                 sse-swap="records" hx-swap="afterbegin" {
-                @for (_, text) in &newest.lines { (source.line(text)) }
+                (source.lines(newest.texts()))
                 @if newest.lines.is_empty() { (empty("There are no records yet.")) }
             }
-        }
-    }
-}
-
-fn lines(source: &RecordSource, newest: &NewestRecords) -> Markup {
-    html! {
-        div.lines role="region" aria-label="Records" tabindex="0" {
-            @for (_, text) in &newest.lines { (source.line(text)) }
         }
     }
 }

@@ -27,7 +27,6 @@ pub(super) struct SearchPart {
 }
 
 impl SearchPart {
-    /// Returns whether anything is searched for.
     pub(super) fn is_search(&self) -> bool {
         !self.text.is_empty() || !self.level.is_empty()
     }
@@ -80,7 +79,7 @@ impl SearchPart {
         let next = found.next.as_deref().map(|next| format!("{here}{}", query(&values(next))));
         Ok(html! {
             div.lines role="region" aria-label="Records" tabindex="0" {
-                @for text in texts { (source.line(&text)) }
+                (source.lines(texts))
             }
             @if found.items.is_empty() && next.is_some() {
                 (empty("Nothing was found so far: go on with older ones."))

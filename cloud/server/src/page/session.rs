@@ -3,8 +3,10 @@
 use axum::http::{HeaderMap, HeaderValue, header};
 use gleaner_fleet::people::User;
 
+pub(super) use crate::cloud::Call;
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
+use crate::store::TokenUser;
 
 /// Name of the cookie. Behind a proxy with TLS it has a prefix, by which browsers accept it only
 /// from this very host and over TLS.
@@ -12,6 +14,9 @@ const COOKIE: &str = "gleaner_session";
 
 /// Lifetime of the cookie, in s: that of the session in the database.
 const LIFETIME_S: u32 = 12 * 3600;
+
+/// A request of a session.
+pub(super) type Visit = Call<PageUser>;
 
 /// The user of a request, with the session.
 #[derive(Debug, Clone)]
@@ -33,7 +38,11 @@ impl PageUser {
         matches!(cloud.store.session(&self.session).await, Ok(Some(user)) if user == self.user)
     }
 
-    /// Returns the session itself.
+    /// Returns the user as one of the API, with a login.
+    pub(super) fn token_user(&self) -> TokenUser {
+        TokenUser::new(self.user.clone(), String::new())
+    }
+
     pub(super) fn session(&self) -> &str {
         &self.session
     }
@@ -51,7 +60,6 @@ impl PageUser {
     }
 }
 
-/// Returns the session in the cookies of a request.
 pub(super) fn session_of(headers: &HeaderMap) -> Option<String> {
     let name = cookie_name(headers);
     let cookies = headers.get_all(header::COOKIE).iter().filter_map(|it| it.to_str().ok());

@@ -37,29 +37,35 @@ pub(super) fn all(here: &str, status: &VehicleStatus) -> Markup {
 }
 
 fn lambda(here: &str, deployment: &DeploymentStatus) -> Markup {
-    let DeploymentStatus { id, lambda, revision, .. } = deployment;
+    let DeploymentStatus { id, lambda, revision, release, failed, .. } = deployment;
     let status = deployment.status.as_ref();
+    let fallback = deployment.fallback.as_ref().filter(|_| deployment.runs_fallback);
+    let runs = fallback.unwrap_or(revision);
     let phase = status.map_or("not started", |status| status.phase.as_str());
-    let class = match phase {
-        "running" => "running",
-        "quarantined" => "failed",
-        _ => "waiting",
+    let (class, state) = match phase {
+        "running" if deployment.runs_fallback => ("waiting", "runs its fallback"),
+        "running" => ("running", phase),
+        "quarantined" => ("failed", phase),
+        _ => ("waiting", phase),
     };
     html! {
         article.card {
             h3 {
                 a href=(format!("{here}/lambdas/{}", segment(id))) { (shown(id)) } " "
-                span.state.(class) { (phase) }
+                span.state.(class) { (state) }
                 @if !deployment.is_wanted { " " span.state.other { "stopped by a user" } }
             }
             p.dim {
-                (shown(lambda)) " " (shown(&revision.version)) ", release " (deployment.release)
-                ", revision " code { (short(&revision.digest)) }
-                @if deployment.runs_fallback { ", " span.warn { "runs its fallback" } }
+                (shown(lambda)) " " (shown(&runs.version))
+                @if fallback.is_some() { " " span.warn { "(fallback)" } }
+                ", release " (release) ", revision " code { (short(&runs.digest)) }
             }
-            @for reason in [&deployment.failed, &deployment.refused].into_iter().flatten() {
-                p.bad { (shown(reason)) }
+            @if let Some(reason) = failed {
+                p.bad { "release " (release) " (" (shown(&revision.version)) ") "
+                    (if reason.starts_with("rolled back by") { "was " } else { "failed: " })
+                    (shown(reason)) }
             }
+            @if let Some(reason) = &deployment.refused { p.bad { (shown(reason)) } }
             @if let Some(reason) = &deployment.stale { p.warn { (shown(reason)) } }
             @if let Some(status) = status { (process(status)) }
         }
@@ -242,7 +248,7 @@ fn vehicle(status: &VehicleStatus) -> Markup {
                         None => span.bad { "none is installed" },
                         Some(trust) => {
                             "version " (trust.version) ", until "
-                            (time(i64::try_from(trust.expires).unwrap_or(i64::MAX)))
+                            (time(trust.expires))
                             @if trust.is_expired { " " span.bad { "expired" } }
                         },
                     }

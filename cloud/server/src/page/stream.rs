@@ -5,7 +5,7 @@ use std::convert::Infallible;
 use std::sync::Arc;
 use std::time::Duration;
 
-use axum::extract::{Extension, Path, Query, State};
+use axum::extract::{Path, Query};
 use axum::http::HeaderMap;
 use axum::response::IntoResponse;
 use axum::response::sse::{Event, Sse};
@@ -17,7 +17,7 @@ use tokio::time::sleep;
 
 use super::layout::PageResult;
 use super::records::RecordSource;
-use super::session::PageUser;
+use super::session::{Call, PageUser, Visit};
 use crate::cloud::Cloud;
 use crate::readers::{ReaderSlot, next_look};
 use crate::tails::TailReader;
@@ -47,32 +47,11 @@ struct RecordFollower {
     _tail: TailReader,
 }
 
-pub(super) async fn time_line(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
-    Path(vehicle): Path<String>,
+pub(super) async fn follow(
+    Call(cloud, user): Visit,
+    Path(source): Path<RecordSource>,
     Query(start): Query<StreamStart>,
     headers: HeaderMap,
-) -> PageResult {
-    follow(cloud, user, RecordSource { vehicle, lambda: None }, start, &headers)
-}
-
-pub(super) async fn lambda(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
-    Path((vehicle, id)): Path<(String, String)>,
-    Query(start): Query<StreamStart>,
-    headers: HeaderMap,
-) -> PageResult {
-    follow(cloud, user, RecordSource { vehicle, lambda: Some(id) }, start, &headers)
-}
-
-fn follow(
-    cloud: Arc<Cloud>,
-    user: PageUser,
-    source: RecordSource,
-    start: StreamStart,
-    headers: &HeaderMap,
 ) -> PageResult {
     let slot = cloud.readers.open(&user.user.name)?;
     let last = headers.get("last-event-id").and_then(|it| it.to_str().ok()?.parse().ok());
@@ -121,7 +100,7 @@ impl RecordFollower {
             return Some(Event::default().comment("nothing new"));
         }
         let markup = html! {
-            @for (_, text) in &newest.lines { (self.source.line(text)) }
+            (self.source.lines(newest.texts()))
             @if newest.has_more {
                 div.line { span.kind.warn { "left out" } span.words {
                     "More records came at once than are shown here: load the page again, and go to \

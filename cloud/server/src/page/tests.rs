@@ -17,6 +17,7 @@ use crate::people::tests::{ROLES, cloud};
 use crate::store::ClipBounds;
 
 mod limits;
+mod vehicles;
 
 const PASSWORD: &str = "correct horse battery staple";
 

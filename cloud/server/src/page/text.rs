@@ -66,12 +66,10 @@ pub(super) fn score(score: f64) -> String {
     }
 }
 
-/// Returns the path of a vehicle's page.
 pub(super) fn vehicle_path(name: &str) -> String {
     format!("/vehicles/{}", segment(name))
 }
 
-/// Returns the path of a deployment's page.
 pub(super) fn deployment_path(id: &str) -> String {
     format!("/deployments/{}", segment(id))
 }
@@ -84,9 +82,10 @@ pub(super) fn label((name, value): (&String, &String)) -> Markup {
 }
 
 /// Returns an element with a time in UTC, in s since 1970.
-pub(super) fn time(seconds: i64) -> Markup {
+pub(super) fn time(seconds: impl TryInto<i64>) -> Markup {
     // The end of year 9999: later ones have no such form.
-    let text = UtcTime::of(seconds.min(253_402_300_799)).to_string();
+    const LAST: i64 = 253_402_300_799;
+    let text = UtcTime::of(seconds.try_into().unwrap_or(LAST).min(LAST)).to_string();
     let (day, rest) = text.split_once('T').unwrap_or_default();
     // On a narrow screen, a line may end between these only.
     let of_day = rest.replace('Z', " UTC");
@@ -139,7 +138,6 @@ pub(super) fn duration(ns: u64) -> String {
     format!("{} {unit}", three_digits(value))
 }
 
-/// Returns a number of bytes with a unit.
 pub(super) fn bytes(bytes: f64) -> String {
     let (mut value, mut unit) = (bytes, "B");
     for next in ["KiB", "MiB", "GiB", "TiB"] {
@@ -151,7 +149,6 @@ pub(super) fn bytes(bytes: f64) -> String {
     format!("{} {unit}", three_digits(value))
 }
 
-/// Returns an amount of a resource in its unit.
 pub(super) fn amount(value: f64, unit: &str) -> String {
     match unit {
         "B" => bytes(value),
@@ -168,7 +165,6 @@ fn three_digits(value: f64) -> String {
     }
 }
 
-/// Returns the start of a digest.
 pub(super) fn short(digest: &str) -> String {
     digest.chars().filter(char::is_ascii_alphanumeric).take(12).collect()
 }

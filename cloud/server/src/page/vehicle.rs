@@ -1,8 +1,6 @@
 //! One vehicle: its lambdas, losses and latencies, its sandbox, and its connection.
 
-use std::sync::Arc;
-
-use axum::extract::{Extension, Path, State};
+use axum::extract::Path;
 use axum::response::{IntoResponse, Redirect};
 use gleaner_fleet::people::{Role, VehicleState, VehicleSummary};
 use gleaner_protocol::vehicle_api::VehicleStatus;
@@ -10,21 +8,17 @@ use maud::{Markup, html};
 
 use super::fleet::state;
 use super::layout::{self, PageResult, confirmed, empty};
-use super::session::PageUser;
+use super::session::{Call, PageUser, Visit};
 use super::status;
 use super::text::{ago, label, shown, vehicle_path};
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
+use crate::people;
 use crate::store::VehicleFilter;
 
-/// Maximum number of problems that are shown.
 const PROBLEMS_MAX: usize = 20;
 
-pub(super) async fn page(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
-    Path(name): Path<String>,
-) -> PageResult {
+pub(super) async fn page(Call(cloud, user): Visit, Path(name): Path<String>) -> PageResult {
     let vehicle = find(&cloud, &name).await?;
     // Absent before the first report, and of a version whose status has another form.
     let status = cloud.store.status(&name).await.ok();
@@ -57,17 +51,12 @@ pub(super) async fn page(
 }
 
 /// Lets a vehicle follow this cloud although it has followed a newer state.
-pub(super) async fn agree(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
-    Path(name): Path<String>,
-) -> PageResult {
-    cloud.store.agree(&user.user.name, &name).await?;
-    cloud.hub.wake(std::slice::from_ref(&name));
-    Ok(Redirect::to(&vehicle_path(&name)).into_response())
+pub(super) async fn agree(Call(cloud, user): Visit, Path(name): Path<String>) -> PageResult {
+    let here = vehicle_path(&name);
+    people::agree(Call(cloud, user.token_user()), Path(name)).await?;
+    Ok(Redirect::to(&here).into_response())
 }
 
-/// Returns a vehicle of the list.
 pub(super) async fn find(cloud: &Cloud, name: &str) -> CloudResult<VehicleSummary> {
     if name.is_empty() {
         return Err(CloudError::missing("a vehicle has a name", "choose one from the fleet"));
@@ -104,9 +93,7 @@ fn summary(vehicle: &VehicleSummary) -> Markup {
         }
         @for problem in vehicle.problems.iter().take(PROBLEMS_MAX) {
             p.banner.bad[!problem.is_pending] {
-                @if !problem.deployment.is_empty() { (shown(&problem.deployment)) ": " }
-                (shown(&problem.in_words()))
-                @if !problem.help.is_empty() { ". " (shown(&problem.help)) }
+                (super::text::block(&problem.explained()))
             }
         }
         @if vehicle.problems.len() > PROBLEMS_MAX {

@@ -15,7 +15,7 @@ use crate::store::{ChangeAuthor, RequestKey, TokenUser};
 /// The header with the key of a request.
 pub(super) const KEY: &str = "idempotency-key";
 
-/// Longest key.
+/// Longest key, in bytes.
 const KEY_MAX: usize = 128;
 
 /// Longest list of tags, in bytes.

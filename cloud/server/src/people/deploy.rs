@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use axum::Json;
 use axum::body::{Body, Bytes};
-use axum::extract::{Extension, Path, State};
+use axum::extract::{Path, State};
 use axum::http::{HeaderMap, StatusCode};
 use gleaner_base::Failure;
 use gleaner_fleet::people::{FleetDeployRequest, ReportedRelease};
@@ -16,7 +16,7 @@ use gleaner_protocol::vehicle_api::{
 use gleaner_trust::{Refusal, Revision, unverified_deployment, unverified_revision};
 
 use super::conditions::ChangeConditions;
-use crate::cloud::Cloud;
+use crate::cloud::{Call, Cloud};
 use crate::error::{CloudError, CloudResult};
 use crate::request::{digest, parsed};
 use crate::store::{OfferedDeployment, TokenUser};
@@ -26,8 +26,7 @@ const REPORTED_MAX: i64 = 100;
 
 /// Stores a deployment, or answers with the files that are missing for it.
 pub(super) async fn deploy(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(actor): Extension<TokenUser>,
+    Call(cloud, actor): Call<TokenUser>,
     headers: HeaderMap,
     body: Bytes,
 ) -> CloudResult<Json<DeployReply>> {

@@ -8,12 +8,11 @@ use gleaner_fleet::people::Role;
 use schemars::{JsonSchema, Schema, SchemaGenerator};
 
 use crate::cloud::Cloud;
+use crate::transfer::OCTETS;
 
-/// A request that the API answers.
 pub(crate) struct Endpoint {
     /// Its method, which the handler has, too.
     pub(crate) method: Method,
-    /// Its path.
     pub(crate) path: &'static str,
     /// The least role; `None` if no token is needed.
     pub(crate) role: Option<Role>,
@@ -80,7 +79,7 @@ impl Endpoint {
 
     /// States that the body is a file.
     pub(super) fn takes_file(self) -> Self {
-        Self { takes: Some(MessageShape { kind: FILE, schema: None }), ..self }
+        Self { takes: Some(MessageShape { kind: OCTETS, schema: None }), ..self }
     }
 
     /// States the type of the answer.
@@ -98,6 +97,3 @@ impl Endpoint {
         Self { gives: Some(MessageShape { kind, schema: None }), ..self }
     }
 }
-
-/// The kind of a file of any content.
-pub(super) const FILE: &str = "application/octet-stream";

@@ -7,11 +7,14 @@ use axum::extract::{Query, State};
 use axum::http::HeaderMap;
 use axum::response::Response;
 use gleaner_fleet::people::{AuditEntry, FleetDeployment, ListPage, User, VehicleSummary};
+use gleaner_fleet::records::FoundRecords;
 
 use super::conditions::tagged;
-use crate::cloud::Cloud;
+use crate::cloud::{Call, Cloud};
 use crate::error::CloudResult;
+use crate::records::RecordSearch;
 use crate::request::ListQuery;
+use crate::store::TokenUser;
 
 pub(super) async fn users(
     State(cloud): State<Arc<Cloud>>,
@@ -50,4 +53,13 @@ pub(super) async fn audit(
     let before = part.after.unwrap_or(u64::MAX);
     let entries = cloud.store.audit(before, part.limit.into()).await?;
     Ok(Json(ListPage::of(entries, part.limit.into(), |entry| entry.seq.to_string())))
+}
+
+pub(super) async fn records(
+    Call(cloud, user): Call<TokenUser>,
+    Query(search): Query<RecordSearch>,
+) -> CloudResult<Json<FoundRecords>> {
+    // It takes memory and time: as many at a time as streams.
+    let _slot = cloud.readers.open(&user.user.name)?;
+    Ok(Json(cloud.search(&search).await?))
 }

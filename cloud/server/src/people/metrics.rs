@@ -14,7 +14,6 @@ use crate::cloud::Cloud;
 use crate::counts::{COUNTS, Count};
 use crate::error::CloudResult;
 
-const VERSION: &str = env!("CARGO_PKG_VERSION");
 const TEXT: &str = "text/plain; version=0.0.4; charset=utf-8";
 
 /// Labels of a sample, or the end of its name, and its value.
@@ -37,7 +36,10 @@ pub(super) async fn health(State(cloud): State<Arc<Cloud>>) -> Response {
         None => (StatusCode::SERVICE_UNAVAILABLE, None),
     };
     let ready = database.is_some();
-    (status, Json(json!({ "ready": ready, "version": VERSION, "database": database })))
+    (
+        status,
+        Json(json!({ "ready": ready, "version": gleaner_base::version(), "database": database })),
+    )
         .into_response()
 }
 
@@ -49,7 +51,7 @@ pub(super) async fn metrics(State(cloud): State<Arc<Cloud>>) -> CloudResult<Resp
     let one = |value: u64| vec![(String::new(), value as f64)];
     let links = one(cloud.hub.open_links(None).len() as u64);
     let lag = vec![(String::new(), cloud.store.age_lag() as f64)];
-    let version = vec![(format!("{{version=\"{VERSION}\"}}"), 1.0)];
+    let version = vec![(format!("{{version=\"{}\"}}", gleaner_base::version()), 1.0)];
     let (records, refused) = (COUNTS.records.read(), COUNTS.refused_links.read());
     let mut text = String::new();
     for (name, kind, help, samples) in [

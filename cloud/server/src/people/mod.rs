@@ -12,10 +12,9 @@ mod lists;
 mod metrics;
 mod openapi;
 mod records;
-mod search;
 #[cfg(test)]
 pub(crate) mod tests;
-mod tokens;
+pub(crate) mod tokens;
 
 use std::sync::Arc;
 
@@ -40,15 +39,16 @@ use serde_json::{Map, Value};
 
 use crate::clients::ClientNetwork;
 use crate::clips::people as clips;
-use crate::cloud::Cloud;
+use crate::cloud::{Call, Cloud};
 use crate::error::{CloudError, CloudResult, as_problem, is_api};
 use crate::page;
 use crate::records::RecordSearch;
 use crate::request::{ListQuery, in_time, parsed};
 use crate::store::{ChangeAuthor, ClipQuery, TokenUser};
+use crate::transfer::OCTETS;
 
 use self::conditions::{ChangeConditions, tagged};
-use self::endpoint::{Endpoint, FILE};
+use self::endpoint::Endpoint;
 use self::records::RecordQuery;
 
 /// Maximum length of a deployment without its files: one with two revisions of 4 MiB each, as
@@ -75,20 +75,13 @@ const LOGIN: &str = "use the token of a login: `gleaner login`";
 #[expect(clippy::too_many_lines, reason = "a table of requests, read from top to bottom")]
 pub(crate) fn endpoints() -> Vec<Endpoint> {
     use Role::{Admin, Deployer, Operator, Viewer};
-    let read = |path, role, summary, handler| {
-        Endpoint::new(Method::GET, path, Some(role), summary, handler)
-    };
-    let send = |path, role, summary, handler| {
-        Endpoint::new(Method::POST, path, Some(role), summary, handler)
-    };
-    let put = |path, role, summary, handler| {
-        Endpoint::new(Method::PUT, path, Some(role), summary, handler)
-    };
-    let remove = |path, role, summary, handler| {
-        Endpoint::new(Method::DELETE, path, Some(role), summary, handler)
-    };
+    let new = Endpoint::new;
+    let read = |path, role, what, handler| new(Method::GET, path, Some(role), what, handler);
+    let send = |path, role, what, handler| new(Method::POST, path, Some(role), what, handler);
+    let put = |path, role, what, handler| new(Method::PUT, path, Some(role), what, handler);
+    let remove = |path, role, what, handler| new(Method::DELETE, path, Some(role), what, handler);
     let deploy = post(deploy::deploy).layer(DefaultBodyLimit::max(BODY_MAX));
-    let open = |method, path, summary, handler| Endpoint::new(method, path, None, summary, handler);
+    let open = |method, path, what, handler| new(method, path, None, what, handler);
     vec![
         open(Method::GET, "/v1/openapi.json", "This description", get(openapi::document))
             .gives::<Map<String, Value>>(),
@@ -144,7 +137,7 @@ pub(crate) fn endpoints() -> Vec<Endpoint> {
         ),
         read("/v1/vehicles/{name}/status", Viewer, "The last report of a vehicle", get(status))
             .gives::<VehicleStatus>(),
-        read("/v1/vehicles/{name}/events", Viewer, "Events of a vehicle", get(records::events))
+        read("/v1/vehicles/{name}/events", Viewer, "Events of a vehicle", get(records::lines))
             .query::<RecordQuery>()
             .headers(RESUMES)
             .gives_lines::<StreamLine>(),
@@ -152,12 +145,12 @@ pub(crate) fn endpoints() -> Vec<Endpoint> {
             "/v1/vehicles/{name}/lambdas/{id}/records",
             Viewer,
             "Records of a deployment on a vehicle",
-            get(records::lambda),
+            get(records::lines),
         )
         .query::<RecordQuery>()
         .headers(RESUMES)
         .gives_lines::<StreamLine>(),
-        read("/v1/records", Viewer, "Searches records of all vehicles", get(search::records))
+        read("/v1/records", Viewer, "Searches records of all vehicles", get(lists::records))
             .query::<RecordSearch>()
             .gives::<FoundRecords>(),
         put(
@@ -221,13 +214,12 @@ pub(crate) fn endpoints() -> Vec<Endpoint> {
             .gives_file("image/jpeg"),
         read("/v1/clips/{id}/file", Viewer, "The file of a clip", get(clips::file))
             .headers(&["Range"])
-            .gives_file(FILE),
+            .gives_file(OCTETS),
         send("/v1/clips/{id}/pull", Operator, "Marks a clip as wanted", post(clips::pull))
             .gives::<FleetClip>(),
     ]
 }
 
-/// Returns the routes.
 pub(crate) fn router(cloud: &Arc<Cloud>) -> Router {
     let mut router = Router::new();
     for Endpoint { path, role, needs_login, handler, .. } in endpoints() {
@@ -333,8 +325,7 @@ async fn me(Extension(user): Extension<TokenUser>) -> Json<User> {
 }
 
 async fn invite(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(actor): Extension<TokenUser>,
+    Call(cloud, actor): Call<TokenUser>,
     headers: HeaderMap,
     body: Bytes,
 ) -> CloudResult<Json<Invitation>> {
@@ -343,9 +334,8 @@ async fn invite(
     Ok(Json(cloud.store.invite(conditions.by(&actor), new).await?))
 }
 
-async fn remove_user(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(actor): Extension<TokenUser>,
+pub(crate) async fn remove_user(
+    Call(cloud, actor): Call<TokenUser>,
     Path(name): Path<String>,
 ) -> CloudResult<StatusCode> {
     cloud.store.remove_user(&actor.actor, &name).await?;
@@ -354,8 +344,7 @@ async fn remove_user(
 }
 
 async fn invite_vehicle(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(actor): Extension<TokenUser>,
+    Call(cloud, actor): Call<TokenUser>,
     headers: HeaderMap,
     body: Bytes,
 ) -> CloudResult<Json<Enrolment>> {
@@ -380,9 +369,8 @@ pub(crate) async fn enrolment(
     })
 }
 
-async fn agree(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(actor): Extension<TokenUser>,
+pub(crate) async fn agree(
+    Call(cloud, actor): Call<TokenUser>,
     Path(name): Path<String>,
 ) -> CloudResult<StatusCode> {
     cloud.store.agree(&actor.actor, &name).await?;
@@ -390,9 +378,8 @@ async fn agree(
     Ok(StatusCode::NO_CONTENT)
 }
 
-async fn revoke(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(actor): Extension<TokenUser>,
+pub(crate) async fn revoke(
+    Call(cloud, actor): Call<TokenUser>,
     Path(name): Path<String>,
 ) -> CloudResult<StatusCode> {
     cloud.store.revoke(&actor.actor, &name).await?;
@@ -444,8 +431,7 @@ pub(crate) async fn change_deployment(
 }
 
 async fn change(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(actor): Extension<TokenUser>,
+    Call(cloud, actor): Call<TokenUser>,
     Path((id, change)): Path<(String, String)>,
     headers: HeaderMap,
 ) -> CloudResult<Response> {
@@ -455,9 +441,8 @@ async fn change(
     tagged(&HeaderMap::new(), &deployment.version, &deployment)
 }
 
-async fn remove_deployment(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(actor): Extension<TokenUser>,
+pub(crate) async fn remove_deployment(
+    Call(cloud, actor): Call<TokenUser>,
     Path(id): Path<String>,
     headers: HeaderMap,
 ) -> CloudResult<StatusCode> {

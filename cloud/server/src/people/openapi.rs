@@ -106,7 +106,6 @@ fn operation(endpoint: &Endpoint, generator: &mut SchemaGenerator) -> Value {
     operation
 }
 
-/// Returns the content of a message, by its type.
 fn content(shape: MessageShape, generator: &mut SchemaGenerator) -> Value {
     let media = shape.schema.map(|schema| json!({ "schema": schema(generator) }));
     json!({ shape.kind: media.unwrap_or_else(|| json!({})) })

@@ -1,23 +1,24 @@
-//! Records of a vehicle in the order of their arrival: as lines of JSON, or as server-sent events
-//! for a client that accepts these. It goes on after a lost connection by `Last-Event-ID`.
+//! Records of a vehicle in the order of their arrival, those of each piece by their times: as lines
+//! of JSON, or as server-sent events for a client that accepts these. It goes on after a lost
+//! connection by `Last-Event-ID`.
 
 use std::sync::Arc;
 use std::time::Duration;
 
 use axum::body::Body;
-use axum::extract::{Extension, Path, Query, State};
+use axum::extract::{Path, Query};
 use axum::http::{HeaderMap, header};
 use axum::response::{IntoResponse, Response};
 use futures_util::stream::try_unfold;
-use gleaner_fleet::people::User;
 use schemars::JsonSchema;
 use serde::Deserialize;
 use tokio::sync::watch;
 use tokio::time::sleep;
 
-use crate::cloud::Cloud;
+use crate::cloud::{Call, Cloud};
 use crate::error::{CloudError, CloudResult};
 use crate::readers::{ReaderSlot, ReaderToken};
+use crate::records::in_time_order;
 use crate::store::TokenUser;
 use crate::tails::TailReader;
 
@@ -43,6 +44,13 @@ pub(super) struct RecordQuery {
     follow: bool,
 }
 
+/// The records that a path names: those of a lambda, or the events of a vehicle.
+#[derive(Debug, Deserialize)]
+pub(super) struct RecordPath {
+    name: String,
+    id: Option<String>,
+}
+
 /// Reads records piece by piece.
 struct RecordReader {
     cloud: Arc<Cloud>,
@@ -63,39 +71,23 @@ struct RecordReader {
     _tail: Option<TailReader>,
 }
 
-pub(super) async fn events(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(TokenUser { user, .. }): Extension<TokenUser>,
-    Path(name): Path<String>,
+pub(super) async fn lines(
+    Call(cloud, TokenUser { user, .. }): Call<TokenUser>,
+    Path(RecordPath { name: vehicle, id }): Path<RecordPath>,
     Query(query): Query<RecordQuery>,
     headers: HeaderMap,
 ) -> CloudResult<Response> {
-    if query.from.is_some() {
-        let message = "`from` counts records of one stream, and these are several";
-        return Err(CloudError::usage(message, "use `last`"));
-    }
-    let streams = ["events".to_owned(), "orchestrator".to_owned()];
-    lines((cloud, user), name, streams, query, &headers).await
-}
-
-pub(super) async fn lambda(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(TokenUser { user, .. }): Extension<TokenUser>,
-    Path((name, id)): Path<(String, String)>,
-    Query(query): Query<RecordQuery>,
-    headers: HeaderMap,
-) -> CloudResult<Response> {
-    let stream = format!("lambdas/{id}");
-    lines((cloud, user), name, [stream.clone(), stream], query, &headers).await
-}
-
-async fn lines(
-    (cloud, user): (Arc<Cloud>, User),
-    vehicle: String,
-    streams: [String; 2],
-    query: RecordQuery,
-    headers: &HeaderMap,
-) -> CloudResult<Response> {
+    let streams = match id {
+        Some(id) => {
+            let stream = format!("lambdas/{id}");
+            [stream.clone(), stream]
+        }
+        None if query.from.is_some() => {
+            let message = "`from` counts records of one stream, and these are several";
+            return Err(CloudError::usage(message, "use `last`"));
+        }
+        None => ["events", "orchestrator"].map(str::to_owned),
+    };
     let accepts = |value: &header::HeaderValue| value.to_str().is_ok_and(|it| it.contains(EVENTS));
     let is_events = headers.get(header::ACCEPT).is_some_and(accepts);
     let position = headers.get("last-event-id").filter(|_| is_events).map(|id| {
@@ -104,7 +96,7 @@ async fn lines(
         id.ok_or_else(|| CloudError::usage("the header `Last-Event-ID` has no id", help))
     });
     let slot = cloud.readers.open(&user.name)?;
-    let token = ReaderToken::new(super::bearer(headers).unwrap_or_default(), &user);
+    let token = ReaderToken::new(super::bearer(&headers).unwrap_or_default(), &user);
     // Before the first look, so that nothing arrives in between.
     let arrivals = query.follow.then(|| cloud.hub.arrivals(&vehicle));
     let names = [&*streams[0], &*streams[1]];
@@ -171,6 +163,10 @@ impl RecordReader {
             lines.extend(self.removed_since(after).await.map_err(failed)?);
             self.arrival = page.arrival;
             lines.extend(page.lines);
+            // Only the last line of a piece has a position: the others may be in any order.
+            if self.streams[0] != self.streams[1] {
+                lines = in_time_order(lines);
+            }
             if !lines.is_empty() {
                 return Ok(Some((self.text(&lines), self)));
             }

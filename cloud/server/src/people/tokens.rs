@@ -1,24 +1,21 @@
 //! Tokens for programs, and the end of the token of a login.
 
-use std::sync::Arc;
-
 use axum::Json;
 use axum::body::Bytes;
-use axum::extract::{Extension, Path, Query, State};
+use axum::extract::{Path, Query};
 use axum::http::{HeaderMap, StatusCode};
 use gleaner_base::excerpt;
 use gleaner_fleet::people::{ListPage, NewToken, Role, TokenSummary, UserToken};
 
 use super::bearer;
 use super::conditions::ChangeConditions;
-use crate::cloud::Cloud;
+use crate::cloud::Call;
 use crate::error::{CloudError, CloudResult};
 use crate::request::{ListQuery, parsed};
 use crate::store::TokenUser;
 
 pub(super) async fn make(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(actor): Extension<TokenUser>,
+    Call(cloud, actor): Call<TokenUser>,
     headers: HeaderMap,
     body: Bytes,
 ) -> CloudResult<Json<UserToken>> {
@@ -29,8 +26,7 @@ pub(super) async fn make(
 }
 
 pub(super) async fn list(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(actor): Extension<TokenUser>,
+    Call(cloud, actor): Call<TokenUser>,
     Query(part): Query<ListQuery<String>>,
 ) -> CloudResult<Json<ListPage<TokenSummary>>> {
     let of = (actor.user.role < Role::Admin).then_some(&*actor.user.name);
@@ -40,9 +36,8 @@ pub(super) async fn list(
     Ok(Json(ListPage::of(tokens, part.limit.into(), position)))
 }
 
-pub(super) async fn remove(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(actor): Extension<TokenUser>,
+pub(crate) async fn remove(
+    Call(cloud, actor): Call<TokenUser>,
     Path((of, name)): Path<(String, String)>,
 ) -> CloudResult<StatusCode> {
     let TokenUser { user, name: own, actor } = actor;
@@ -61,8 +56,7 @@ pub(super) async fn remove(
 }
 
 pub(super) async fn logout(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(actor): Extension<TokenUser>,
+    Call(cloud, actor): Call<TokenUser>,
     headers: HeaderMap,
 ) -> CloudResult<StatusCode> {
     if let Some(token) = bearer(&headers) {

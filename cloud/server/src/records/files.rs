@@ -23,7 +23,6 @@ pub(crate) struct ChunkFiles {
 }
 
 impl ChunkFiles {
-    /// Creates the access to a place of files.
     pub(crate) fn new(place: FilePlace) -> Self {
         Self { place, parts: AtomicU64::new(0) }
     }

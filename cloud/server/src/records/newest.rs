@@ -10,7 +10,6 @@ use crate::store::{KeptLine, LINE_MAX, NewestRecords, StoredChunk, large_line};
 /// Number of rows that are read at a time.
 const ROWS: i64 = 256;
 
-/// A record that was found.
 #[derive(Debug, Clone)]
 pub(crate) struct FoundLine {
     pub(crate) arrival: i64,

@@ -1,5 +1,6 @@
 //! Moves old records into chunks, and removes those that are too old.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use gleaner_base::{Exit, Failure};
@@ -17,14 +18,14 @@ const LOOKS: Duration = Duration::from_secs(60);
 const GRACE_S: i64 = 3600;
 
 /// Moves records into chunks and removes old ones, for as long as the program runs.
-pub(crate) async fn keep(cloud: &Cloud) {
+pub(crate) async fn keep(cloud: Arc<Cloud>) {
     let mut looks = interval(LOOKS);
     loop {
         looks.tick().await;
-        if let Err(error) = pack(cloud, ChunkSizes::DEFAULT).await {
+        if let Err(error) = pack(&cloud, ChunkSizes::DEFAULT).await {
             tracing::warn!(reason = error.reason(), "old records stay in the database for now");
         }
-        if let Err(error) = remove_old(cloud, GRACE_S).await {
+        if let Err(error) = remove_old(&cloud, GRACE_S).await {
             tracing::warn!(reason = error.reason(), "old records are not removed");
         }
     }

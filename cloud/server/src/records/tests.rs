@@ -31,7 +31,6 @@ impl Recorded {
         Self { folder, cloud, epoch }
     }
 
-    /// Appends records with these numbers to a stream.
     async fn append(&self, stream: &str, seqs: std::ops::Range<u64>) {
         self.append_within(stream, seqs, Retention::DEFAULT).await;
     }

@@ -38,7 +38,6 @@ const BEGIN_SQLITE: &str = "BEGIN IMMEDIATE";
 /// place in the audit trail. The number is that of this program.
 const BEGIN_POSTGRES: &str = "BEGIN; SELECT pg_advisory_xact_lock(7021465)";
 
-/// The place of the database.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum StoreAddress {
     /// A file of SQLite, as a URL.

@@ -9,10 +9,9 @@
 use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
-use super::{CloudStore, StoreChange, now};
+use super::{CloudStore, DAY_S, StoreChange, now};
 use crate::error::CloudResult;
 
-const DAY_S: i64 = 86_400;
 /// The most that the time between two processes counts, as only clocks of machines measure it.
 const AWAY_MAX_S: i64 = 3 * DAY_S;
 /// Time for which a new process only looks, to find others that count. It is longer than the

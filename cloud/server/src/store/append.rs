@@ -7,7 +7,7 @@ use gleaner_fleet::{Ack, Cursor};
 use super::numbers::{check_life, check_number};
 use super::records::{Retention, StreamBatch};
 use super::writer::{GroupVehicles, VehicleWrite, Waiting, WaitingWrite, counting};
-use super::{CloudStore, StoreChange, in_list, int, list_parts, parts, unsigned};
+use super::{CloudStore, StoreChange, int, list_parts, parts, unsigned};
 use crate::counts::COUNTS;
 use crate::error::{CloudError, CloudResult};
 use crate::sqlx::{self, AssertSqlSafe};
@@ -48,12 +48,10 @@ struct StoredStream {
 impl VehicleWrite for AppendWrite {
     type Done = Ack;
 
+    const WAITING: fn(Waiting<Self>) -> WaitingWrite = WaitingWrite::Append;
+
     fn vehicle(&self) -> &str {
         &self.name
-    }
-
-    fn waiting(write: Waiting<Self>) -> WaitingWrite {
-        WaitingWrite::Append(write)
     }
 }
 
@@ -98,7 +96,6 @@ impl StoredStreams {
         self.0.get_mut(vehicle)?.known.get_mut(stream)
     }
 
-    /// Returns the bytes that are kept of each of these streams.
     fn kept_bytes(&self, keys: &BTreeMap<StreamKey<'_>, Retention>) -> Vec<i64> {
         keys.keys().map(|key| self.get(*key).map_or(0, |stored| stored.kept_bytes)).collect()
     }
@@ -154,26 +151,19 @@ impl StoreChange<'_> {
         vehicles: &[&String],
     ) -> CloudResult<HashMap<String, Vec<Cursor>>> {
         let mut cursors = HashMap::<_, Vec<_>>::new();
-        for part in list_parts(vehicles) {
-            let sql = format!(
-                "SELECT vehicle, stream, life, next, seq, boot, boot_ns FROM streams
-                 WHERE vehicle IN ({}) ORDER BY stream",
-                in_list(part.len())
-            );
-            let query = sqlx::query_as(AssertSqlSafe(sql));
-            let query = part.iter().fold(query, |query, name| query.bind(*name));
-            let rows: Vec<(String, String, i64, i64, i64, String, i64)> =
-                query.fetch_all(&mut *self.tx).await?;
-            for (vehicle, stream, life, next, seq, boot, boot_ns) in rows {
-                cursors.entry(vehicle).or_default().push(Cursor {
-                    stream,
-                    life: unsigned(life),
-                    next: unsigned(next),
-                    seq: unsigned(seq),
-                    boot,
-                    boot_ns: unsigned(boot_ns),
-                });
-            }
+        let rows: Vec<(String, String, i64, i64, i64, String, i64)> = rows_in!(&mut *self.tx;
+            "SELECT vehicle, stream, life, next, seq, boot, boot_ns FROM streams
+             WHERE vehicle IN () ORDER BY stream";
+            vehicles);
+        for (vehicle, stream, life, next, seq, boot, boot_ns) in rows {
+            cursors.entry(vehicle).or_default().push(Cursor {
+                stream,
+                life: unsigned(life),
+                next: unsigned(next),
+                seq: unsigned(seq),
+                boot,
+                boot_ns: unsigned(boot_ns),
+            });
         }
         Ok(cursors)
     }
@@ -268,17 +258,12 @@ impl StoreChange<'_> {
             .collect();
         names.sort_unstable();
         names.dedup();
-        for part in list_parts(&names) {
-            let sql = format!(
-                "SELECT vehicle, COUNT(*) FROM streams WHERE vehicle IN ({}) AND next > 0
-                 GROUP BY vehicle",
-                in_list(part.len())
-            );
-            let query = sqlx::query_as::<_, (String, i64)>(AssertSqlSafe(sql));
-            let query = part.iter().fold(query, |query, name| query.bind(*name));
-            for (vehicle, count) in query.fetch_all(&mut *self.tx).await? {
-                streams.0.entry(vehicle).or_default().count = count;
-            }
+        let counts: Vec<(String, i64)> = rows_in!(&mut *self.tx;
+            "SELECT vehicle, COUNT(*) FROM streams WHERE vehicle IN () AND next > 0
+             GROUP BY vehicle";
+            &names);
+        for (vehicle, count) in counts {
+            streams.0.entry(vehicle).or_default().count = count;
         }
         Ok(streams)
     }
@@ -388,19 +373,14 @@ impl StoreChange<'_> {
             }
         }
         let names: Vec<_> = to_sum.keys().copied().collect();
-        for part in list_parts(&names) {
-            let sql = format!(
-                "SELECT vehicle, CAST(SUM(kept_bytes) AS BIGINT) FROM streams
-                 WHERE vehicle IN ({}) GROUP BY vehicle",
-                in_list(part.len())
-            );
-            let query = sqlx::query_as::<_, (String, i64)>(AssertSqlSafe(sql));
-            let query = part.iter().fold(query, |query, name| query.bind(*name));
-            for (vehicle, bytes) in query.fetch_all(&mut *self.tx).await? {
-                let most = to_sum.get(&*vehicle).copied().unwrap_or(i64::MAX);
-                if bytes > most {
-                    self.make_room_of_all(&vehicle, most).await?;
-                }
+        let sums: Vec<(String, i64)> = rows_in!(&mut *self.tx;
+            "SELECT vehicle, CAST(SUM(kept_bytes) AS BIGINT) FROM streams
+             WHERE vehicle IN () GROUP BY vehicle";
+            &names);
+        for (vehicle, bytes) in sums {
+            let most = to_sum.get(&*vehicle).copied().unwrap_or(i64::MAX);
+            if bytes > most {
+                self.make_room_of_all(&vehicle, most).await?;
             }
         }
         Ok(())

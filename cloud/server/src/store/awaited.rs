@@ -32,7 +32,6 @@ impl CloudStore {
         change.commit().await
     }
 
-    /// Returns the length of a file that a deployment waits for.
     pub(crate) async fn awaited_length(&self, sha256: &str) -> CloudResult<u64> {
         let row: Option<(i64,)> = row!(&self.pool;
             "SELECT bytes FROM awaited_files WHERE sha256 = $1"; sha256);

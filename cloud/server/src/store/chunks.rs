@@ -12,7 +12,6 @@ const CHUNK_RECORDS: i64 = 8192;
 /// Number of streams that are packed, and of files that are removed, at a time.
 const AT_ONCE: i64 = 500;
 
-/// A record as it is kept.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct KeptLine {
     pub(crate) arrival: i64,
@@ -40,7 +39,6 @@ pub(crate) struct StoredChunk {
     pub(crate) sha256: String,
 }
 
-/// Sizes of the chunks that are made.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct ChunkSizes {
     /// Bytes of lines in a chunk.
@@ -50,7 +48,6 @@ pub(crate) struct ChunkSizes {
 }
 
 impl ChunkSizes {
-    /// The sizes of the program.
     pub(crate) const DEFAULT: ChunkSizes = ChunkSizes { chunk: 1 << 20, rows: 256 << 10 };
 }
 
@@ -180,7 +177,6 @@ impl CloudStore {
         Ok(row.map(chunk))
     }
 
-    /// Returns whether the index still has this chunk.
     pub(crate) async fn has_chunk(
         &self,
         (vehicle, stream): (&str, &str),
@@ -228,7 +224,6 @@ impl CloudStore {
         Ok(files.into_iter().map(|(sha256,)| sha256).collect())
     }
 
-    /// Forgets files of chunks that were removed.
     pub(crate) async fn forget_chunk_files(&self, removed: &[String]) -> CloudResult<()> {
         let mut change = self.change().await?;
         change.run_in("DELETE FROM chunk_files WHERE sha256 IN", removed).await?;

@@ -10,10 +10,9 @@ use gleaner_fleet::clips::{
 use super::numbers::check_number;
 use super::vehicles::ended;
 use super::wants::next_wanted;
-use super::{CloudStore, StoreChange, int, now, unsigned};
+use super::{CloudStore, DAY_S, StoreChange, int, now, unsigned};
 use crate::error::{CloudError, CloudResult};
 
-const DAY_S: i64 = 86_400;
 /// Number of clips of a vehicle that are wanted, and of thumbnails, in its orders.
 const ORDERS_MAX: i64 = 64;
 /// Number of uploads of another file than announced, after which a clip is not wanted any more.
@@ -35,7 +34,6 @@ pub(crate) struct ClipBounds {
 }
 
 impl ClipBounds {
-    /// The bounds of the program.
     pub(crate) const DEFAULT: ClipBounds = ClipBounds {
         clips: 20_000,
         vehicle_bytes: 64 << 30,
@@ -324,7 +322,6 @@ impl CloudStore {
         Ok(rows.into_iter().filter_map(clip_id).collect())
     }
 
-    /// Returns the rules for uploads.
     pub(crate) async fn clip_policy(&self) -> CloudResult<ClipPolicy> {
         let (upload, day_bytes, keep_s, keep_bytes): (String, i64, i64, i64) =
             one!(&self.pool; "SELECT upload, day_bytes, keep_s, keep_bytes FROM clip_policy");

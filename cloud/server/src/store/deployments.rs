@@ -165,7 +165,6 @@ impl CloudStore {
         self.some_deployments(ReleaseChoice::Part(after, most)).await
     }
 
-    /// Returns one of the [`deployments`](Self::deployments).
     pub(crate) async fn deployment(&self, id: &str) -> CloudResult<FleetDeployment> {
         self.some_deployments(ReleaseChoice::Of(id)).await?.pop().ok_or_else(|| unknown(id))
     }
@@ -180,7 +179,12 @@ impl CloudStore {
         let mut deployments = Vec::new();
         for release in releases {
             let all = release.count(&mut tx, false).await?;
-            let waves = release.progress(&mut tx).await?;
+            // Vehicles that the waves have not reached do not have the release: no failure.
+            let reached = match &*release.state {
+                COMPLETE => all,
+                _ => release.count(&mut tx, true).await?,
+            };
+            let waves = release.progress(&reached)?;
             let others: Vec<(String,)> = rows!(&mut *tx;
                 "SELECT DISTINCT selector FROM releases WHERE deployment = $1 AND number <> $2";
                 &release.deployment, release.number);
@@ -197,8 +201,8 @@ impl CloudStore {
                 is_wanted: release.is_wanted != 0,
                 vehicles: all.vehicles,
                 running: all.running,
-                // Vehicles that the waves have not reached do not have the release: no failure.
-                failed: waves.as_ref().map_or(all.failed, |waves| waves.failed),
+                failed: reached.failed,
+                on_fallback: reached.on_fallback,
                 waves,
             });
         }
@@ -227,7 +231,6 @@ impl CloudStore {
         row.map(|(envelope,)| envelope).ok_or_else(|| unknown(id))
     }
 
-    /// Returns the envelope of a deployment with this SHA-256.
     pub(crate) async fn envelope(&self, sha256: &str) -> CloudResult<Option<String>> {
         Ok(self.envelopes.find(sha256).await?.map(|(_, envelope)| envelope))
     }

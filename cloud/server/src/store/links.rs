@@ -9,23 +9,23 @@ use gleaner_protocol::vehicle_api::{DeploymentStatus, VehicleStatus};
 
 use super::numbers::check_number;
 use super::vehicles::{FAILED, PENDING, RUNNING, ended, json};
-use super::wants::WishedVehicle;
+use super::wants::{WishedVehicle, map};
 use super::writer::{DOUBLE, GroupVehicles, VehicleWrite, Waiting, WaitingWrite, counting};
-use super::{CloudStore, StoreChange, in_list, int, list_parts, now, now_ms, parts, unsigned};
+use super::{CloudStore, StoreChange, int, now, now_ms, parts, unsigned};
 use crate::error::{CloudError, CloudResult};
 use crate::sqlx::{self, AssertSqlSafe};
 
 /// Maximum number of deployments in a report that count.
 const DEPLOYMENTS_MAX: usize = 1000;
 
-/// A report of a vehicle, as it is stored.
 #[derive(Debug, Default, Clone, PartialEq)]
 pub(crate) struct VehicleReport {
     /// Number of the newest wanted state that it has handled.
     pub(crate) handled: u64,
     pub(crate) problems: Vec<WantedProblem>,
     pub(crate) version: String,
-    pub(crate) labels: BTreeMap<String, String>,
+    /// Its labels; `None` keeps those of before.
+    pub(crate) labels: Option<BTreeMap<String, String>>,
     /// The state of each deployment that it has or refuses, by its id and the SHA-256 of its
     /// envelope.
     pub(crate) states: BTreeMap<(String, String), DeploymentState>,
@@ -45,6 +45,8 @@ pub(crate) struct DeploymentState {
     pub(crate) release: u64,
     pub(crate) state: &'static str,
     pub(crate) reason: String,
+    /// True if it has failed and its fallback runs.
+    pub(crate) on_fallback: bool,
 }
 
 impl VehicleReport {
@@ -61,7 +63,7 @@ impl VehicleReport {
             let reason = excerpt(&it.in_words());
             (
                 (it.deployment.clone(), it.envelope.clone()),
-                DeploymentState { release: 0, state, reason },
+                DeploymentState { state, reason, ..DeploymentState::default() },
             )
         });
         // What it has counts before what it could not change.
@@ -81,7 +83,7 @@ impl VehicleReport {
             version: excerpt(&status.orchestrator.version),
             states,
             deployments: all as u64,
-            labels: status.labels,
+            labels: Some(status.labels),
             status: json,
             has_new_states: true,
         }
@@ -92,18 +94,23 @@ fn state(deployment: &DeploymentStatus) -> DeploymentState {
     let lambda = deployment.status.as_ref();
     let phase = lambda.map(|status| status.phase);
     let quarantined = lambda.filter(|it| it.phase == LambdaPhase::Quarantined);
+    // Without a fallback, one whose wakes fault runs on. The status may be of an earlier attempt.
+    let tried = lambda.filter(|it| !deployment.is_proven && it.attempt == deployment.attempt);
+    let running = tried.filter(|it| it.phase == LambdaPhase::Running);
+    let faulty = running.and_then(|it| it.recent.faulty());
     let reason = deployment.refused.as_ref().or(deployment.failed.as_ref());
-    let reason = reason.or(quarantined.and_then(|it| it.last_end.as_ref()));
+    let reason = reason.or(quarantined.and_then(|it| it.last_end.as_ref())).or(faulty.as_ref());
     let state = match phase {
         _ if reason.is_some() || quarantined.is_some() => FAILED,
         Some(LambdaPhase::Running) => RUNNING,
         _ => "other",
     };
     let reason = reason.map(|it| excerpt(&in_one_line(it))).unwrap_or_default();
-    DeploymentState { release: deployment.release, state, reason }
+    let on_fallback =
+        state == FAILED && deployment.runs_fallback && phase == Some(LambdaPhase::Running);
+    DeploymentState { release: deployment.release, state, reason, on_fallback }
 }
 
-/// A connection that begins.
 pub(super) struct ConnectWrite {
     name: String,
     certificate: String,
@@ -121,12 +128,10 @@ impl VehicleWrite for ConnectWrite {
     /// The number of the connection, and the positions of all streams of its vehicle.
     type Done = (u64, Vec<Cursor>);
 
+    const WAITING: fn(Waiting<Self>) -> WaitingWrite = WaitingWrite::Connect;
+
     fn vehicle(&self) -> &str {
         &self.name
-    }
-
-    fn waiting(write: Waiting<Self>) -> WaitingWrite {
-        WaitingWrite::Connect(write)
     }
 }
 
@@ -141,12 +146,10 @@ impl VehicleWrite for ReportWrite {
     /// True if the wanted state has changed with the labels.
     type Done = bool;
 
+    const WAITING: fn(Waiting<Self>) -> WaitingWrite = WaitingWrite::Report;
+
     fn vehicle(&self) -> &str {
         &self.name
-    }
-
-    fn waiting(write: Waiting<Self>) -> WaitingWrite {
-        WaitingWrite::Report(write)
     }
 }
 
@@ -194,7 +197,6 @@ fn double(name: &str) -> CloudError {
 type Certificates = HashMap<String, Vec<(String, i64)>>;
 
 impl StoreChange<'_> {
-    /// Begins connections.
     pub(super) async fn connect_all(
         &mut self,
         vehicles: &mut GroupVehicles,
@@ -272,16 +274,10 @@ impl StoreChange<'_> {
 
     async fn certificates_of(&mut self, names: &[&str]) -> CloudResult<Certificates> {
         let mut certificates = Certificates::new();
-        for part in list_parts(names) {
-            let sql = format!(
-                "SELECT vehicle, sha256, expires FROM certificates WHERE vehicle IN ({})",
-                in_list(part.len())
-            );
-            let query = sqlx::query_as::<_, (String, String, i64)>(AssertSqlSafe(sql));
-            let query = part.iter().fold(query, |query, name| query.bind(*name));
-            for (vehicle, sha256, expires) in query.fetch_all(&mut *self.tx).await? {
-                certificates.entry(vehicle).or_default().push((sha256, expires));
-            }
+        let rows: Vec<(String, String, i64)> = rows_in!(&mut *self.tx;
+            "SELECT vehicle, sha256, expires FROM certificates WHERE vehicle IN ()"; names);
+        for (vehicle, sha256, expires) in rows {
+            certificates.entry(vehicle).or_default().push((sha256, expires));
         }
         // A vehicle whose name came twice was read twice.
         for all in certificates.values_mut() {
@@ -301,7 +297,7 @@ impl StoreChange<'_> {
         // The newest report of each vehicle; states are new if those of any report are.
         let mut rows: BTreeMap<&str, (&VehicleReport, bool)> = BTreeMap::new();
         for waiting in reports.iter_mut() {
-            let ReportWrite { name, epoch, report } = &waiting.write;
+            let ReportWrite { name, epoch, report } = &mut waiting.write;
             let vehicle = match counting(vehicles, name, int(*epoch)) {
                 Ok(vehicle) => vehicle,
                 Err(error) => {
@@ -311,8 +307,8 @@ impl StoreChange<'_> {
             };
             waiting.result = Some(Ok(false));
             let has_new_states = rows.get(&**name).is_some_and(|(_, before)| *before);
-            rows.insert(name, (report, has_new_states || report.has_new_states));
-            let labels = json(&report.labels);
+            let labels = json(report.labels.get_or_insert_with(|| map(&vehicle.labels)));
+            rows.insert(&**name, (&*report, has_new_states || report.has_new_states));
             if labels != vehicle.labels {
                 vehicle.labels.clone_from(&labels);
                 let digest = vehicle.digest.clone();
@@ -374,14 +370,14 @@ impl StoreChange<'_> {
         });
         for part in parts(&states.collect::<Vec<_>>()) {
             let sql = format!(
-                "INSERT INTO reported (vehicle, deployment, envelope, number, state, reason)
-                 VALUES {}",
-                self.placeholders(part.len(), 6)
+                "INSERT INTO reported (vehicle, deployment, envelope, number, state, reason,
+                 on_fallback) VALUES {}",
+                self.placeholders(part.len(), 7)
             );
             let mut query = sqlx::query(AssertSqlSafe(sql));
-            for (name, (id, envelope), DeploymentState { release, state, reason }) in part {
-                query = query.bind(*name).bind(id).bind(envelope).bind(int(*release));
-                query = query.bind(*state).bind(reason);
+            for (name, (id, envelope), it) in part {
+                query = query.bind(*name).bind(id).bind(envelope).bind(int(it.release));
+                query = query.bind(it.state).bind(&it.reason).bind(i64::from(it.on_fallback));
             }
             query.execute(&mut *self.tx).await?;
         }

@@ -32,6 +32,22 @@ macro_rules! rows {
     };
 }
 
+/// Runs a query with `IN ()` for these values, its only ones, 256 at a time; returns all rows. An
+/// order or a group is one of each part, and a value that comes twice may bring its rows twice.
+macro_rules! rows_in {
+    ($on:expr; $sql:expr; $values:expr) => {{
+        let mut rows = Vec::new();
+        for part in crate::store::list_parts($values) {
+            let list = format!("IN ({})", crate::store::in_list(part.len()));
+            let sql = crate::sqlx::AssertSqlSafe($sql.replace("IN ()", &list));
+            let query = crate::sqlx::query_as(sql);
+            let query = part.iter().fold(query, |query, value| query.bind(*value));
+            rows.append(&mut query.fetch_all($on).await?);
+        }
+        rows
+    }};
+}
+
 mod address;
 mod age_clock;
 mod append;
@@ -94,7 +110,7 @@ pub(crate) use users::CONSOLE;
 pub(crate) use vehicles::Issued;
 
 /// The migrations, oldest first: the version of a database is the number of those that it has.
-const MIGRATIONS: &[&str] = &[
+pub(crate) const MIGRATIONS: &[&str] = &[
     include_str!("../../migrations/0001_start.sql"),
     include_str!("../../migrations/0002_releases.sql"),
     include_str!("../../migrations/0003_clips.sql"),
@@ -109,7 +125,10 @@ const MIGRATIONS: &[&str] = &[
     include_str!("../../migrations/0013_reported_envelopes.sql"),
     include_str!("../../migrations/0014_lives.sql"),
     include_str!("../../migrations/0015_age_clock.sql"),
+    include_str!("../../migrations/0016_fallbacks.sql"),
 ];
+
+const DAY_S: i64 = 86_400;
 
 /// Maximum number of queries at a time: with more threads than cores, each only takes longer.
 const QUERIES_MAX: u32 = 4;
@@ -148,6 +167,20 @@ impl CloudStore {
     ///
     /// A failure if it cannot be opened, or a later version of the program has made it.
     pub(crate) async fn open(address: &StoreAddress) -> Result<Self, Failure> {
+        Self::opened(address, false).await
+    }
+
+    /// Opens a database that may be in use by a running cloud.
+    ///
+    /// # Errors
+    ///
+    /// A failure if it cannot be opened, or is of another version: brought to a newer one, it could
+    /// not be used by that cloud any more.
+    pub(crate) async fn in_use(address: &StoreAddress) -> Result<Self, Failure> {
+        Self::opened(address, true).await
+    }
+
+    async fn opened(address: &StoreAddress, in_use: bool) -> Result<Self, Failure> {
         let (changes, pool) = (address.connect(1).await?, address.connect(QUERIES_MAX).await?);
         let turn = Arc::new(Mutex::new(address.begin()));
         let writes = WriteQueue::start(changes.clone(), Arc::clone(&turn));
@@ -172,12 +205,12 @@ impl CloudStore {
             is_file,
             replica,
         };
-        store.migrate().await?;
+        store.migrate(in_use).await?;
         store.count_age().await?;
         Ok(store)
     }
 
-    async fn migrate(&self) -> CloudResult<()> {
+    async fn migrate(&self, in_use: bool) -> CloudResult<()> {
         let mut change = self.change().await?;
         sqlx::raw_sql("CREATE TABLE IF NOT EXISTS migrations (version BIGINT PRIMARY KEY)")
             .execute(&mut *change.tx)
@@ -186,9 +219,12 @@ impl CloudStore {
             one!(&mut *change.tx; "SELECT COALESCE(MAX(version), 0) FROM migrations");
         let newest = MIGRATIONS.len();
         let version = usize::try_from(version).unwrap_or(usize::MAX);
-        if version > newest {
+        if version > newest || in_use && version < newest {
             let message = format!("the database has version {version}; this program has {newest}");
-            let help = "start the version of gleaner-cloud that made it, or a later one";
+            let help = match version > newest {
+                true => "start the version of gleaner-cloud that made it, or a later one",
+                false => "use the gleaner-cloud that made it; `serve` of this one upgrades it",
+            };
             return Err(CloudError::usage(message, help));
         }
         for (index, sql) in MIGRATIONS.iter().enumerate().skip(version) {
@@ -199,7 +235,6 @@ impl CloudStore {
         change.commit().await
     }
 
-    /// Returns the version of the database.
     pub(crate) async fn version(&self) -> CloudResult<i64> {
         let (version,): (i64,) = one!(&self.pool; "SELECT MAX(version) FROM migrations");
         Ok(version)
@@ -292,7 +327,6 @@ impl StoreChange<'_> {
         (0..rows).map(row).collect::<Vec<_>>().join(", ")
     }
 
-    /// Makes the change durable.
     pub(crate) async fn commit(self) -> CloudResult<()> {
         Ok(self.tx.commit().await?)
     }

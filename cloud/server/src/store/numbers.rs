@@ -9,7 +9,6 @@ use crate::error::{CloudError, CloudResult};
 /// Largest number of a vehicle, as in its spools: each can still be counted up.
 pub(crate) const NUMBER_MAX: u64 = 1 << 62;
 
-/// Refuses a number that is too large.
 pub(super) fn check_number(name: &str, number: u64) -> CloudResult<()> {
     check_up_to(NUMBER_MAX, || name.to_owned(), number)
 }

@@ -17,7 +17,6 @@ const STREAMS_MAX: usize = 64;
 /// Number of vehicles that a search looks at, at a time.
 const VEHICLES_AT_ONCE: i64 = 100;
 
-/// Choice of vehicles.
 #[derive(Debug, Default)]
 pub(crate) struct VehicleFilter {
     /// The whole name; any if it is empty.
@@ -54,6 +53,12 @@ pub(crate) struct NewestRecords {
     pub(crate) oldest_read: i64,
     /// True if older ones in the same range were left out.
     pub(crate) has_more: bool,
+}
+
+impl NewestRecords {
+    pub(crate) fn texts(&self) -> impl DoubleEndedIterator<Item = &str> {
+        self.lines.iter().map(|(_, line)| &**line)
+    }
 }
 
 impl CloudStore {
@@ -116,8 +121,9 @@ impl CloudStore {
         Ok(page)
     }
 
-    /// Returns the vehicles that have reported the deployment of this envelope, with their states
-    /// and reasons: first those with a failure, at most `most`.
+    /// Returns the vehicles that have reported the deployment of this envelope, with their states,
+    /// of which `fallback` is a failure with a fallback that runs, and reasons: first those with a
+    /// failure, at most `most`.
     pub(crate) async fn reports(
         &self,
         deployment: &str,
@@ -125,7 +131,8 @@ impl CloudStore {
         most: i64,
     ) -> CloudResult<Vec<(String, String, String)>> {
         Ok(rows!(&self.pool;
-            "SELECT vehicle, state, reason FROM reported WHERE deployment = $1 AND envelope = $2
+            "SELECT vehicle, CASE WHEN on_fallback = 1 THEN 'fallback' ELSE state END, reason
+             FROM reported WHERE deployment = $1 AND envelope = $2
              ORDER BY CASE WHEN state = $3 THEN 0 ELSE 1 END, vehicle LIMIT $4";
             deployment, envelope, FAILED, most))
     }

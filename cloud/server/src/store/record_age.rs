@@ -2,10 +2,9 @@
 //! of each vehicle, and all records up to a note are at least as old as it is. Days are those of
 //! the clock by which records age.
 
-use super::CloudStore;
+use super::{CloudStore, DAY_S};
 use crate::error::CloudResult;
 
-const DAY_S: i64 = 86_400;
 /// Number of vehicles whose records are removed at a time.
 const VEHICLES_AT_ONCE: i64 = 100;
 

@@ -19,7 +19,6 @@ pub(crate) struct Retention {
 }
 
 impl Retention {
-    /// The bounds of the program.
     pub(crate) const DEFAULT: Retention =
         Retention { records: 1_000_000, bytes: 64 << 20, vehicle_bytes: 512 << 20 };
 }

@@ -21,7 +21,6 @@ pub(crate) struct OwnLink {
     pub(crate) generation: u64,
 }
 
-/// The end of a connection.
 pub(super) struct DisconnectWrite {
     vehicle: String,
     epoch: u64,
@@ -30,12 +29,10 @@ pub(super) struct DisconnectWrite {
 impl VehicleWrite for DisconnectWrite {
     type Done = ();
 
+    const WAITING: fn(Waiting<Self>) -> WaitingWrite = WaitingWrite::Disconnect;
+
     fn vehicle(&self) -> &str {
         &self.vehicle
-    }
-
-    fn waiting(write: Waiting<Self>) -> WaitingWrite {
-        WaitingWrite::Disconnect(write)
     }
 }
 

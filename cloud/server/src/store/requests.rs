@@ -84,7 +84,6 @@ impl StoreChange<'_> {
         Ok(Some(answer))
     }
 
-    /// Keeps the answer to a request with a key.
     pub(super) async fn keep_answer(
         &mut self,
         author: ChangeAuthor<'_>,

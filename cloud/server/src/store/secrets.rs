@@ -1,12 +1,9 @@
 //! Secrets: stored as their SHA-256, found by it, and valid for a while. With 256 random bits, a
 //! plain hash cannot be searched.
 
-use super::{CloudStore, StoreChange, now};
+use super::{CloudStore, DAY_S, StoreChange, now};
 use crate::error::{CloudError, CloudResult};
 
-const DAY_S: i64 = 86_400;
-
-/// The use of a secret.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum SecretKind {
     /// One-time code of a user.
@@ -93,7 +90,6 @@ impl StoreChange<'_> {
         Ok(subject.map(|(subject,)| subject))
     }
 
-    /// Removes the secrets of `subject` but `kept`.
     pub(super) async fn drop_other_secrets(
         &mut self,
         kind: SecretKind,
@@ -106,16 +102,12 @@ impl StoreChange<'_> {
         Ok(())
     }
 
-    /// Removes the secrets of `subject`.
     pub(super) async fn drop_secrets(
         &mut self,
         kind: SecretKind,
         subject: &str,
     ) -> CloudResult<()> {
-        run!(&mut *self.tx;
-            "DELETE FROM secrets WHERE kind = $1 AND subject = $2";
-            kind.as_str(), subject);
-        Ok(())
+        self.drop_other_secrets(kind, subject, "").await
     }
 }
 

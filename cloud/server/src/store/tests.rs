@@ -30,7 +30,7 @@ impl CloudStore {
     }
 }
 
-pub(super) async fn store() -> (TempDir, CloudStore) {
+pub(crate) async fn store() -> (TempDir, CloudStore) {
     let folder = TempDir::new().unwrap();
     let store = CloudStore::of_test(&folder).await;
     (folder, store)
@@ -66,7 +66,7 @@ pub(super) fn offered(id: &str, release: u64, fleet: &str) -> OfferedDeployment 
     }
 }
 
-pub(super) fn report(labels: Value, deployments: Value) -> VehicleReport {
+pub(crate) fn report(labels: Value, deployments: Value) -> VehicleReport {
     let program = json!({ "version": "1.2", "pid": 1, "up_s": 1.0, "rss_bytes": 1, "cpu_s": 1.0 });
     let status = json!({
         "vehicle": "car-7", "key": "k", "labels": labels, "orchestrator": program, "trust": null,
@@ -347,7 +347,7 @@ async fn a_changed_entry_of_the_audit_trail_is_detected() {
 }
 
 #[tokio::test]
-async fn the_database_of_a_later_version_is_refused() {
+async fn the_database_of_another_version_is_refused_or_upgraded_by_serve_alone() {
     let (folder, store) = store().await;
     store.execute("INSERT INTO migrations (version) VALUES (99)").await;
     store.close().await;
@@ -355,6 +355,16 @@ async fn the_database_of_a_later_version_is_refused() {
     let expected = format!("the database has version 99; this program has {}", MIGRATIONS.len());
     assert_eq!(refused.message, expected);
     assert!(refused.help.is_some());
+    // A backup, or an invitation, beside a cloud of the version before.
+    let (folder, store) = self::store().await;
+    let last = "DELETE FROM migrations WHERE version = (SELECT MAX(version) FROM migrations)";
+    store.execute(last).await;
+    store.close().await;
+    let refused = CloudStore::in_use(&address(&folder).await).await.err().unwrap();
+    let (before, newest) = (MIGRATIONS.len() - 1, MIGRATIONS.len());
+    let expected = format!("the database has version {before}; this program has {newest}");
+    assert_eq!(refused.message, expected);
+    assert!(refused.help.is_some_and(|help| help.contains("`serve`")));
 }
 
 #[tokio::test]

@@ -46,7 +46,6 @@ impl CloudStore {
         Ok(Some(TokenUser::new(user, token)))
     }
 
-    /// Makes a named token of a user.
     pub(crate) async fn make_token(
         &self,
         (user, author): (&User, ChangeAuthor<'_>),
@@ -131,7 +130,6 @@ impl CloudStore {
         change.commit().await
     }
 
-    /// Ends the token of a request.
     pub(crate) async fn end_token(&self, actor: &str, token: &str) -> CloudResult<()> {
         let mut change = self.change().await?;
         if let Some(user) = change.take_secret(SecretKind::Token, token).await? {

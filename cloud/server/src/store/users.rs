@@ -135,7 +135,6 @@ impl CloudStore {
         change.commit().await
     }
 
-    /// Returns the users after this name, at most `most`.
     pub(crate) async fn users(&self, after: &str, most: u64) -> CloudResult<Vec<User>> {
         let rows: Vec<_> = rows!(&self.pool;
             "SELECT name, role FROM users WHERE name > $1 ORDER BY name LIMIT $2";

@@ -136,7 +136,6 @@ impl CloudStore {
         Ok(found.filter(|(expires, _)| *expires > now()).map(|(_, name)| name))
     }
 
-    /// Returns the vehicles after this name, at most `most`.
     pub(crate) async fn vehicles(
         &self,
         after: &str,
@@ -222,7 +221,6 @@ impl StoreChange<'_> {
         Ok(())
     }
 
-    /// Removes all certificates of a vehicle but `kept`.
     async fn drop_certificates(&mut self, name: &str, kept: &str) -> CloudResult<()> {
         run!(&mut *self.tx;
             "DELETE FROM certificates WHERE vehicle = $1 AND sha256 <> $2";

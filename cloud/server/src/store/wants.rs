@@ -27,7 +27,6 @@ const CACHED_MAX: usize = 32_000;
 
 pub(super) type TextMap = BTreeMap<String, String>;
 
-/// The state that a vehicle should have.
 #[derive(Debug, PartialEq)]
 pub(crate) struct VehicleWants {
     pub(crate) generation: u64,
@@ -82,7 +81,6 @@ struct WishedRelease {
 }
 
 impl CloudStore {
-    /// Returns the state that a vehicle should have.
     pub(crate) async fn wants(&self, name: &str) -> CloudResult<VehicleWants> {
         let (generation, digest) = self.wants.find(name).await?.ok_or_else(ended)?;
         let same = digest.strip_suffix(AHEAD);
@@ -196,16 +194,10 @@ impl FleetWishes {
         if self.releases.iter().all(|release| release.is_complete) {
             return Ok(());
         }
-        for part in parts(names) {
-            let sql = format!(
-                "SELECT vehicle, deployment, number FROM wave_members WHERE vehicle IN ({})",
-                in_list(part.len())
-            );
-            let query = sqlx::query_as::<_, (String, String, i64)>(AssertSqlSafe(sql));
-            let query = part.iter().fold(query, |query, name| query.bind(*name));
-            for (vehicle, deployment, number) in query.fetch_all(&mut **tx).await? {
-                self.members.entry(vehicle).or_default().insert((deployment, number));
-            }
+        let rows: Vec<(String, String, i64)> = rows_in!(&mut **tx;
+            "SELECT vehicle, deployment, number FROM wave_members WHERE vehicle IN ()"; names);
+        for (vehicle, deployment, number) in rows {
+            self.members.entry(vehicle).or_default().insert((deployment, number));
         }
         Ok(())
     }

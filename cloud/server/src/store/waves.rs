@@ -6,7 +6,7 @@ use gleaner_fleet::waves::{OnFailure, WavePlan, WaveProgress, WaveState};
 use sha2::{Digest, Sha256};
 
 use super::deployments::{COMPLETE, unknown};
-use super::vehicles::{FAILED, PENDING, RUNNING};
+use super::vehicles::{FAILED, RUNNING};
 use super::wants::{ChangedVehicles, TextMap, map, selects};
 use super::{ChangeAuthor, CloudStore, StoreChange, int, now, unsigned};
 use crate::error::{CloudError, CloudResult};
@@ -16,13 +16,12 @@ use crate::sqlx::{self, FromRow, Row};
 /// Actor of steps that the cloud takes by a plan.
 const WAVES: &str = "waves";
 
-/// Time after which a wave does not wait for vehicles that have not shown up since it opened, in s.
-/// It covers several intervals at which signs of life are stored.
+/// Time after which a wave does not wait for vehicles that are not connected, in s. It covers
+/// several intervals at which signs of life are stored.
 const AWAY_S: i64 = 120;
 
 type Tx = sqlx::Transaction<'static, sqlx::Any>;
 
-/// A release, as it is stored.
 #[derive(Debug)]
 pub(super) struct Release {
     pub(super) deployment: String,
@@ -47,13 +46,14 @@ pub(super) struct VehicleCount {
     pub(super) vehicles: u64,
     pub(super) running: u64,
     pub(super) failed: u64,
+    /// Those of the failed ones that run the fallback.
+    pub(super) on_fallback: u64,
     /// Those of the failed ones that a person knew of when the waves went on.
     forgiven: u64,
-    /// Those without the release that have not shown up since the wave opened.
+    /// Those of a wave that fell silent before the end of its soak time, also if they ran it.
     away: u64,
 }
 
-/// A step of the waves of a release.
 #[derive(Debug, PartialEq)]
 enum WaveStep {
     Wait,
@@ -188,7 +188,6 @@ impl CloudStore {
 }
 
 impl StoreChange<'_> {
-    /// Returns the newest release of a deployment.
     pub(super) async fn newest(&mut self, id: &str) -> CloudResult<Option<Release>> {
         Ok(newest_releases(&mut self.tx, ReleaseChoice::Of(id)).await?.pop())
     }
@@ -319,69 +318,79 @@ impl Release {
         Ok(shares.get(index).copied().unwrap_or(100).into())
     }
 
-    /// Counts its vehicles, or those of them that its waves have reached.
+    fn soak_end(&self) -> CloudResult<i64> {
+        Ok(self.since.saturating_add(int(self.plan()?.soak_s)))
+    }
+
+    /// Counts its vehicles, or those of them that its waves have reached: of these, one that is
+    /// silent does not count as running, as the release may be the reason.
     pub(super) async fn count(&self, tx: &mut Tx, only_members: bool) -> CloudResult<VehicleCount> {
+        let soak_end = if only_members { self.soak_end()? } else { 0 };
         // Grouped by labels, of which there are few: SQL cannot compare them with the selector.
-        let groups: Vec<(String, String, i64, i64)> = rows!(&mut **tx;
+        let groups: Vec<(String, String, i64, i64, i64)> = rows!(&mut **tx;
             "SELECT labels,
-             CASE WHEN reported.state <> $6 THEN reported.state
-                  WHEN seen < $3 THEN 'away'
-                  ELSE 'late' END AS standing,
-             COALESCE(is_forgiven, 0), COUNT(*)
+             CASE WHEN reported.state = $6 THEN reported.state
+                  WHEN seen < $3 AND replica NOT IN (SELECT id FROM replicas)
+                  THEN CASE WHEN seen < $7 THEN 'away' ELSE 'late' END
+                  ELSE COALESCE(reported.state, 'late') END AS standing,
+             COALESCE(on_fallback, 0), COALESCE(is_forgiven, 0), COUNT(*)
              FROM vehicles LEFT JOIN reported
              ON reported.vehicle = vehicles.name AND reported.deployment = $1
              AND reported.envelope = $5
              LEFT JOIN wave_members ON wave_members.vehicle = vehicles.name
              AND wave_members.deployment = $1 AND wave_members.number = $2
              WHERE is_revoked = 0 AND epoch > 0 AND ($4 = 0 OR wave_members.vehicle IS NOT NULL)
-             GROUP BY 1, 2, 3";
-            &self.deployment, self.number, self.since, i64::from(only_members), &self.sha256,
-            PENDING);
+             GROUP BY 1, 2, 3, 4";
+            &self.deployment, self.number, soak_end, i64::from(only_members), &self.sha256, FAILED,
+            now() - AWAY_S);
         let (selector, mut count) = (map(&self.selector), VehicleCount::default());
-        for (labels, standing, is_forgiven, vehicles) in groups {
+        for (labels, standing, on_fallback, is_forgiven, vehicles) in groups {
             let labels: TextMap = map(&labels);
             if !selects(&selector, &labels) {
                 continue;
             }
             let vehicles = unsigned(vehicles);
             count.vehicles += vehicles;
-            let has_failed = standing == FAILED;
-            let counter = match &*standing {
-                FAILED => &mut count.failed,
-                RUNNING => &mut count.running,
-                "away" => &mut count.away,
-                _ => continue,
-            };
-            *counter += vehicles;
-            if has_failed && is_forgiven != 0 {
-                count.forgiven += vehicles;
+            match &*standing {
+                FAILED => {
+                    count.failed += vehicles;
+                    count.on_fallback += if on_fallback == 0 { 0 } else { vehicles };
+                    count.forgiven += if is_forgiven == 0 { 0 } else { vehicles };
+                }
+                RUNNING => count.running += vehicles,
+                "away" => count.away += vehicles,
+                _ => {}
             }
         }
         Ok(count)
     }
 
-    /// Returns the first vehicle of its waves that has failed, with the reason, for an end of a
-    /// sentence; empty without one.
+    /// Returns the first vehicle of its waves that has failed, or else is silent, with the reason,
+    /// for an end of a sentence; empty without one.
     async fn failure(&self, tx: &mut Tx) -> CloudResult<String> {
         let row: Option<(String, String)> = row!(&mut **tx;
-            "SELECT reported.vehicle, reason FROM reported JOIN wave_members
-             ON wave_members.vehicle = reported.vehicle AND wave_members.deployment = $1
-             AND wave_members.number = $2 AND is_forgiven = 0
-             WHERE reported.deployment = $1 AND envelope = $3 AND state = $4
-             ORDER BY reported.vehicle LIMIT 1";
-            &self.deployment, self.number, &self.sha256, FAILED);
+            "SELECT name, COALESCE(reason, 'not connected since the soak time')
+             FROM wave_members JOIN vehicles ON name = wave_members.vehicle
+             LEFT JOIN reported ON reported.vehicle = name AND reported.deployment = $1
+             AND envelope = $4 AND reported.state = $5
+             WHERE wave_members.deployment = $1 AND wave_members.number = $2 AND is_revoked = 0
+             AND CASE WHEN reason IS NOT NULL THEN is_forgiven = 0
+                 ELSE seen < $3 AND replica NOT IN (SELECT id FROM replicas) END
+             ORDER BY CASE WHEN reason IS NULL THEN 1 ELSE 0 END, name LIMIT 1";
+            &self.deployment, self.number, self.soak_end()?, &self.sha256, FAILED);
         Ok(row.map(|(vehicle, reason)| format!(" ({vehicle}: {reason})")).unwrap_or_default())
     }
 
-    /// Returns the progress of its waves, unless it is open to all.
-    pub(super) async fn progress(&self, tx: &mut Tx) -> CloudResult<Option<WaveProgress>> {
+    /// Returns the progress of its waves, which have reached these vehicles, unless it is open to
+    /// all.
+    pub(super) fn progress(&self, count: &VehicleCount) -> CloudResult<Option<WaveProgress>> {
         let state = match &*self.state {
             "running" => WaveState::Running,
             "paused" => WaveState::Paused,
             "aborted" => WaveState::Aborted,
             _ => return Ok(None),
         };
-        let (plan, count) = (self.plan()?, self.count(tx, true).await?);
+        let plan = self.plan()?;
         Ok(Some(WaveProgress {
             wave: unsigned(self.wave),
             waves: plan.shares.len() as u64 + 1,
@@ -399,7 +408,7 @@ impl Release {
     fn next(&self, count: &VehicleCount, now: i64) -> CloudResult<WaveStep> {
         let plan = self.plan()?;
         let open_s = unsigned(now.saturating_sub(self.since));
-        let VehicleCount { vehicles, running, failed, forgiven, away } = *count;
+        let VehicleCount { vehicles, running, failed, forgiven, away, .. } = *count;
         let share = |part: u64, percent: u8| part * 100 > vehicles * u64::from(percent);
         let new = failed - forgiven;
         if new > 0 && share(new, plan.failures) {

@@ -10,10 +10,10 @@ use tokio::sync::{Mutex, mpsc, oneshot};
 use super::append::AppendWrite;
 use super::links::{ConnectWrite, ReportWrite};
 use super::replicas::DisconnectWrite;
-use super::{CloudStore, StoreChange, begin, in_list, list_parts};
+use super::{CloudStore, StoreChange, begin};
 use crate::counts::COUNTS;
 use crate::error::{CloudError, CloudResult};
-use crate::sqlx::{self, AnyPool, AssertSqlSafe};
+use crate::sqlx::AnyPool;
 
 /// Maximum number of writes in a transaction, so that other changes have their turn. With 1,024,
 /// 10,000 vehicles stored no more in a second.
@@ -22,10 +22,10 @@ const GROUP_MAX: usize = 256;
 pub(super) trait VehicleWrite: Sized {
     type Done;
 
-    fn vehicle(&self) -> &str;
+    /// Makes the write one of a group.
+    const WAITING: fn(Waiting<Self>) -> WaitingWrite;
 
-    /// Returns the write as one of a group.
-    fn waiting(write: Waiting<Self>) -> WaitingWrite;
+    fn vehicle(&self) -> &str;
 }
 
 /// A write that waits for its transaction.
@@ -137,7 +137,7 @@ impl CloudStore {
     /// Writes with others; returns once the write is durable.
     pub(super) async fn write<W: VehicleWrite>(&self, write: W) -> CloudResult<W::Done> {
         let (reply, result) = oneshot::channel();
-        let waiting = W::waiting(Waiting { write, result: None, reply });
+        let waiting = (W::WAITING)(Waiting { write, result: None, reply });
         self.writes.0.send(waiting).await.map_err(|_| stopped())?;
         result.await.map_err(|_| stopped())?
     }
@@ -199,30 +199,25 @@ impl StoreChange<'_> {
     async fn group_vehicles(&mut self, group: &[WaitingWrite]) -> CloudResult<GroupVehicles> {
         let mut vehicles = GroupVehicles::with_capacity(group.len());
         let names: Vec<_> = group.iter().map(WaitingWrite::vehicle).collect();
-        for part in list_parts(&names) {
-            let names = in_list(part.len());
-            let sql = format!(
-                "SELECT name, labels, digest, boot, former_boot, epoch, is_revoked, arrived,
-                 generation, is_ahead, is_double, offered FROM vehicles WHERE name IN ({names})"
-            );
-            let query = sqlx::query_as::<_, VehicleNumbers>(AssertSqlSafe(sql));
-            let query = part.iter().fold(query, |query, name| query.bind(*name));
-            for row in query.fetch_all(&mut *self.tx).await? {
-                let (name, labels, digest, boot, former, epoch, is_revoked, ..) = row;
-                let vehicle = GroupVehicle {
-                    epoch,
-                    is_revoked: is_revoked != 0,
-                    arrived: row.7,
-                    labels,
-                    digest,
-                    generation: row.8,
-                    is_ahead: row.9,
-                    boots: [boot, former],
-                    is_double: row.10,
-                    offered: row.11,
-                };
-                vehicles.insert(name, vehicle);
-            }
+        let rows: Vec<VehicleNumbers> = rows_in!(&mut *self.tx;
+            "SELECT name, labels, digest, boot, former_boot, epoch, is_revoked, arrived,
+             generation, is_ahead, is_double, offered FROM vehicles WHERE name IN ()";
+            &names);
+        for row in rows {
+            let (name, labels, digest, boot, former, epoch, is_revoked, ..) = row;
+            let vehicle = GroupVehicle {
+                epoch,
+                is_revoked: is_revoked != 0,
+                arrived: row.7,
+                labels,
+                digest,
+                generation: row.8,
+                is_ahead: row.9,
+                boots: [boot, former],
+                is_double: row.10,
+                offered: row.11,
+            };
+            vehicles.insert(name, vehicle);
         }
         Ok(vehicles)
     }

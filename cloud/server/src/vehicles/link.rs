@@ -1,6 +1,5 @@
 //! The control channel of a vehicle, from its first frame to its end.
 
-use std::collections::BTreeMap;
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -9,13 +8,12 @@ use axum::body::Bytes;
 use futures_util::{SinkExt, StreamExt};
 use gleaner_base::{Exit, Failure, RateLimit, excerpt};
 use gleaner_fleet::{
-    Ack, Body, Desired, Frame, GoAway, Hello, PROTOCOL, Ping, Pong, Records, Reported, TAIL_S,
-    TAIL_STREAMS_MAX, Tail, WantedProblem, Welcome, decompress,
+    Ack, Body, Desired, Frame, GoAway, Hello, PROBLEMS_MAX, PROTOCOL, Ping, Pong, Records,
+    Reported, TAIL_S, TAIL_STREAMS_MAX, Tail, WantedProblem, Welcome, decompress,
 };
 use gleaner_protocol::vehicle_api::VehicleStatus;
 use hyper::upgrade::Upgraded;
 use hyper_util::rt::TokioIo;
-use serde::de::IgnoredAny;
 use tokio::sync::{SemaphorePermit, watch};
 use tokio::time::{MissedTickBehavior, interval, sleep, timeout};
 use tokio_tungstenite::WebSocketStream;
@@ -46,11 +44,6 @@ const WRITES: RateLimit = RateLimit::of(20.0, 100.0);
 /// Length of a report or of records, decompressed, that does not count among the frames that are
 /// stored at a time: many small ones are committed together.
 const SMALL: usize = 16 << 10;
-/// Number of the problems of a report that count, of the causes of each, and of the characters of
-/// each of these.
-const PROBLEMS_MAX: usize = 100;
-const CAUSES_MAX: usize = 8;
-const PROBLEM_MAX: usize = 300;
 /// Number of labels of a vehicle, and of the bytes of a name or value.
 const LABEL_MAX: usize = 256;
 
@@ -76,7 +69,6 @@ struct StoredReport {
     states: u64,
 }
 
-/// Serves a connection until its end.
 pub(super) async fn serve(cloud: &Cloud, (name, certificate): (&str, &str), socket: VehicleSocket) {
     let mut link = VehicleLink {
         cloud,
@@ -326,13 +318,11 @@ fn lease(tail: &VehicleTail) -> Tail {
 fn report(name: &str, reported: Reported) -> CloudResult<VehicleReport> {
     let json = decompress(&reported.status).map_err(|error| wrong(error.to_string()))?;
     let json = String::from_utf8(json).map_err(|error| wrong(error.to_string()))?;
-    // An object, to which the age is added: it has none itself.
-    let fields = serde_json::from_str::<BTreeMap<String, IgnoredAny>>(&json);
-    let fields = fields.map_err(|error| wrong(format!("a status is none: {error}")))?;
     let status: VehicleStatus =
         serde_json::from_str(&json).map_err(|error| wrong(format!("a status is none: {error}")))?;
-    if fields.contains_key("age_s") {
-        return Err(wrong("a status has an age, which only the cloud knows"));
+    // The age is added to the object. As an array, it would have no names.
+    if status.age_s.is_some() || !json.trim_start().starts_with('{') {
+        return Err(wrong("a status is an object without an age, which only the cloud knows"));
     }
     let is_long = |text: &String| text.len() > LABEL_MAX;
     let mut labels = status.labels.iter();
@@ -340,15 +330,19 @@ fn report(name: &str, reported: Reported) -> CloudResult<VehicleReport> {
         return Err(wrong(format!("a vehicle has at most {LABEL_MAX} labels, each as short")));
     }
     let problems = reported.problems.iter().take(PROBLEMS_MAX);
-    let mut problems: Vec<_> = problems.map(|it| it.bounded(CAUSES_MAX, PROBLEM_MAX)).collect();
-    if status.vehicle != name {
+    let mut problems: Vec<_> = problems.map(|it| it.bounded()).collect();
+    let is_itself = status.vehicle == name;
+    if !is_itself {
         problems.push(WantedProblem {
             title: format!("it calls itself `{}`", excerpt(&status.vehicle)),
             help: "set its name back in vehicle.toml, or enrol it under the new one".to_owned(),
             ..WantedProblem::default()
         });
     }
-    Ok(VehicleReport::new(reported.generation, problems, status, json))
+    let mut report = VehicleReport::new(reported.generation, problems, status, json);
+    // Its vehicle.toml may be empty after a power cut: what its former labels select stays there.
+    report.labels = report.labels.filter(|_| is_itself);
+    Ok(report)
 }
 
 impl StoredReport {
@@ -376,8 +370,10 @@ mod tests {
     use std::thread;
 
     use gleaner_fleet::compress;
+    use serde_json::json;
 
     use super::*;
+    use crate::store::tests::{self, connected};
 
     #[tokio::test]
     async fn a_large_frame_is_parsed_beside_the_threads_of_connections() {
@@ -389,5 +385,16 @@ mod tests {
             assert_eq!(other == own, is_own, "{bytes}");
         }
         assert!(text_max(b"no frame") > SMALL, "its length is unknown");
+    }
+
+    #[tokio::test]
+    async fn a_vehicle_that_calls_itself_otherwise_keeps_its_labels() {
+        let (_folder, store) = tests::store().await;
+        let epoch = connected(&store, "car-8").await;
+        store.report("car-8", epoch, tests::report(json!({ "a": "b" }), json!([]))).await.unwrap();
+        let of_car_7 = tests::report(json!({}), json!([])).status;
+        let reported = Reported { status: compress(of_car_7.as_bytes()), ..Reported::default() };
+        store.report("car-8", epoch, report("car-8", reported).unwrap()).await.unwrap();
+        assert_eq!(store.vehicles("", 1).await.unwrap()[0].labels["a"], "b");
     }
 }

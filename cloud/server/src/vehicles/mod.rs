@@ -30,13 +30,12 @@ use tokio_tungstenite::tungstenite::protocol::{Role, WebSocketConfig};
 
 use crate::accept::PeerConnection;
 use crate::clients::ClientNetwork;
-use crate::cloud::Cloud;
+use crate::cloud::{Call, Cloud};
 use crate::error::{CloudError, CloudResult};
 use crate::request::{digest, in_time, parsed};
 use crate::store::Issued;
 use crate::transfer::OCTETS;
 
-/// Maximum length of the body of a request.
 const BODY_MAX: usize = 64 << 10;
 /// Buffer for reading frames: with the default of 128 KiB, idle vehicles would take ten times the
 /// memory. Most frames are shorter than this.
@@ -49,7 +48,6 @@ pub(crate) struct KnownVehicle {
     certificate: String,
 }
 
-/// Returns the routes.
 pub(crate) fn router(cloud: &Arc<Cloud>) -> Router {
     Router::new()
         .route("/v1/renew", post(renew).layer(from_fn(in_time)))
@@ -113,8 +111,7 @@ async fn enrol(
 }
 
 async fn renew(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(vehicle): Extension<KnownVehicle>,
+    Call(cloud, vehicle): Call<KnownVehicle>,
     body: Bytes,
 ) -> CloudResult<Json<EnrolReply>> {
     let RenewRequest { csr } = parsed(&body, "request for a certificate")?;
@@ -131,8 +128,7 @@ fn reply(Issued { certificate, renew, expires, .. }: Issued) -> EnrolReply {
 /// Opens the control channel. The WebSockets of axum are not used: they need an older tungstenite,
 /// with a second `rand` and a third `getrandom`.
 async fn link(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(vehicle): Extension<KnownVehicle>,
+    Call(cloud, vehicle): Call<KnownVehicle>,
     Extension(peer): Extension<Arc<PeerConnection>>,
     mut request: Request,
 ) -> CloudResult<Response> {
@@ -162,8 +158,7 @@ async fn link(
 /// Sends a deployment that the vehicle should have. Only from one it learns the digests of
 /// revisions and their files, so that these need no check of their own.
 async fn deployment(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(vehicle): Extension<KnownVehicle>,
+    Call(cloud, vehicle): Call<KnownVehicle>,
     Path(sha256): Path<String>,
 ) -> CloudResult<Response> {
     let digest = digest(&sha256)?;

@@ -34,7 +34,6 @@ const fn jpeg(width: u16, height: u16) -> [u8; 100_000] {
     image
 }
 
-/// Returns the facts of a clip with this content.
 pub(crate) fn facts(name: &str, label: &str, at_ns: i64, content: &[u8]) -> Value {
     let moment = json!({ "lambda": "brake", "kind": "event", "label": label, "score": 0.5,
                          "attributes": { "lat": 59.9 }, "at_ns": at_ns });
@@ -45,7 +44,6 @@ pub(crate) fn facts(name: &str, label: &str, at_ns: i64, content: &[u8]) -> Valu
             "triggers": 1, "moments": [moment] })
 }
 
-/// A content of two parts.
 pub(crate) fn two_parts() -> Vec<u8> {
     (0..CLIP_PART + 5).map(|byte| byte as u8).collect()
 }

@@ -9,6 +9,7 @@ use futures_util::{SinkExt, StreamExt};
 use gleaner_fleet::{
     Body, Cursor, Desired, EnrolReply, EnrolRequest, Enrolment, Frame, Hello, Ping, Welcome,
 };
+use gleaner_trust::{Deployment, Grants, Revision, RevisionFile, SecretKey, seal, sha256};
 use http_body_util::{BodyExt, Full};
 use hyper::body::Incoming;
 use hyper::client::conn::http1;
@@ -49,14 +50,12 @@ async fn whole(reply: Response<Incoming>) -> (StatusCode, Vec<u8>) {
     (status, soon(reply.into_body().collect()).await.unwrap().to_bytes().to_vec())
 }
 
-/// A person with a token.
 pub(crate) struct Person {
     address: SocketAddr,
     token: String,
 }
 
 impl Person {
-    /// Logs in.
     pub(crate) async fn login(address: SocketAddr, code: &str) -> Self {
         let stranger = Self { address, token: String::new() };
         let session = stranger.call(Method::POST, "/v1/login", json!({ "code": code })).await;
@@ -109,7 +108,6 @@ impl Person {
         String::from_utf8(text).unwrap()
     }
 
-    /// Returns the lines of an answer.
     pub(crate) async fn lines(&self, path: &str) -> Vec<String> {
         let (status, text) = whole(self.open(Method::GET, path, b"").await).await;
         assert_eq!(status, StatusCode::OK);
@@ -124,14 +122,82 @@ impl Person {
         (vehicle.unwrap(), enrolment)
     }
 
-    /// Returns a vehicle of the list.
+    /// Deploys, with the file if it is missing; returns the digest of the envelope.
+    pub(crate) async fn deploy(&self, signed: &Signed) -> String {
+        let reply = self.call(Method::POST, "/v1/deployments", signed.request()).await;
+        if reply["result"] == "missing" {
+            let object = format!("/v1/objects/{}", reply["objects"][0]["sha256"].as_str().unwrap());
+            let refused = self.open(Method::PUT, &object, b"another").await.status();
+            assert_eq!(refused, StatusCode::FORBIDDEN);
+            let sent = self.open(Method::PUT, &object, &signed.file).await.status();
+            assert_eq!(sent, StatusCode::NO_CONTENT);
+            let reply = self.call(Method::POST, "/v1/deployments", signed.request()).await;
+            assert_eq!(reply["result"], "accepted", "{reply}");
+        }
+        sha256(signed.deployment.as_bytes()).to_string()
+    }
+
     pub(crate) async fn vehicle(&self, name: &str) -> Value {
         let all = self.call(Method::GET, "/v1/vehicles", Value::Null).await;
         all["items"].as_array().unwrap().iter().find(|it| it["name"] == name).unwrap().clone()
     }
 }
 
-/// A vehicle with a certificate.
+/// A signed deployment of a lambda with one file.
+pub(crate) struct Signed {
+    pub(crate) deployment: String,
+    pub(crate) revision: String,
+    pub(crate) digest: String,
+    pub(crate) file: Vec<u8>,
+    /// The envelope of its fallback.
+    fallback: Option<String>,
+}
+
+impl Signed {
+    pub(crate) fn new(id: &str, release: u64, fallback: Option<&Self>) -> Self {
+        let key = SecretKey::generate().unwrap();
+        let file = format!("[lambda]\nname = \"{id}\"\n").into_bytes();
+        let revision = Revision {
+            name: id.parse().unwrap(),
+            version: format!("1.{release}.0").parse().unwrap(),
+            kind: serde_json::from_value(json!("wasm")).unwrap(),
+            release,
+            created: 1_790_000_000,
+            files: vec![RevisionFile {
+                path: "lambda.toml".parse().unwrap(),
+                bytes: file.len() as u64,
+                sha256: sha256(&file),
+            }],
+        };
+        let digest = sha256(&serde_json::to_vec(&revision).unwrap());
+        let deployment = Deployment {
+            id: id.parse().unwrap(),
+            release,
+            selector: [("fleet".parse().unwrap(), "test".to_owned())].into(),
+            revision: digest.clone(),
+            fallback: fallback.map(|it| it.digest.parse().unwrap()),
+            config: [].into(),
+            grants: Grants { topics: vec!["/imu".parse().unwrap()], ..Grants::default() },
+            created: 1,
+            expires: 2,
+        };
+        let text = |envelope: Vec<u8>| String::from_utf8(envelope).unwrap();
+        Self {
+            deployment: text(seal(&deployment, &[&key]).unwrap()),
+            revision: text(seal(&revision, &[&key]).unwrap()),
+            digest: digest.to_string(),
+            file,
+            fallback: fallback.map(|it| it.revision.clone()),
+        }
+    }
+
+    /// Returns the request that deploys it.
+    pub(crate) fn request(&self) -> Value {
+        let revisions: Vec<_> = std::iter::once(&self.revision).chain(&self.fallback).collect();
+        json!({ "deployment": self.deployment, "revisions": revisions })
+    }
+}
+
 pub(crate) struct FakeVehicle {
     pub(crate) address: String,
     config: Arc<ClientConfig>,
@@ -161,17 +227,6 @@ async fn tls(address: &str, config: &Arc<ClientConfig>) -> TlsStream<TcpStream> 
     soon(TlsConnector::from(Arc::clone(config)).connect(name, stream)).await.unwrap()
 }
 
-async fn post(
-    address: &str,
-    config: &Arc<ClientConfig>,
-    path: &str,
-    body: &impl serde::Serialize,
-) -> (StatusCode, Vec<u8>) {
-    let body = Full::new(Bytes::from(serde_json::to_vec(body).unwrap()));
-    let request = Request::post(path).header("host", "cloud").body(body).unwrap();
-    whole(soon(send(tls(address, config).await, request)).await.unwrap()).await
-}
-
 /// Returns a request for a certificate that asks for more than it gets.
 pub(crate) fn csr(key: &KeyPair) -> String {
     let params = CertificateParams::new(vec!["another-vehicle".to_owned()]).unwrap();
@@ -184,22 +239,22 @@ impl FakeVehicle {
         let Enrolment { address, vehicle, authority, token, .. } = enrolment.clone();
         let key = KeyPair::generate().unwrap();
         let request = EnrolRequest { vehicle, token, csr: csr(&key) };
-        let without = config(&authority, None);
-        let (status, reply) = post(&address, &without, "/v1/enrol", &request).await;
+        let request = serde_json::to_vec(&request).unwrap();
+        let stranger = Self { address, config: config(&authority, None) };
+        let (status, reply) = stranger.request(Method::POST, "/v1/enrol", &request).await;
         let reply = serde_json::from_slice::<EnrolReply>(&reply).ok();
         let config = reply.map(|it| config(&authority, Some((&it.certificate, &key))));
-        (status, config.map(|config| Self { address, config }))
+        (status, config.map(|config| Self { config, ..stranger }))
     }
 
     /// Sends a request with the certificate.
     pub(crate) async fn post(&self, path: &str, body: &impl serde::Serialize) -> StatusCode {
-        post(&self.address, &self.config, path, body).await.0
+        self.request(Method::POST, path, &serde_json::to_vec(body).unwrap()).await.0
     }
 
     /// Fetches something with the certificate.
     pub(crate) async fn get(&self, path: &str) -> (StatusCode, Vec<u8>) {
-        let request = Request::get(path).header("host", "cloud").body(Full::default()).unwrap();
-        whole(soon(send(tls(&self.address, &self.config).await, request)).await.unwrap()).await
+        self.request(Method::GET, path, b"").await
     }
 
     /// Requests the control channel with these headers; returns the answer.
@@ -211,7 +266,6 @@ impl FakeVehicle {
         soon(send(self.stream().await, request)).await.unwrap()
     }
 
-    /// Sends a request with a body; returns the answer.
     pub(crate) async fn request(
         &self,
         method: Method,
@@ -248,7 +302,6 @@ impl FakeVehicle {
         (link, welcome, desired)
     }
 
-    /// Opens the control channel.
     pub(crate) async fn link(&self) -> Result<FakeLink, tungstenite::Error> {
         let stream = tls(&self.address, &self.config).await;
         let opened = tokio_tungstenite::client_async("ws://cloud/v1/link", stream);
@@ -260,7 +313,6 @@ impl FakeVehicle {
 pub(crate) struct FakeLink(WebSocketStream<TlsStream<TcpStream>>);
 
 impl FakeLink {
-    /// Sends a frame.
     pub(crate) async fn send(&mut self, body: Body) {
         self.send_bytes(Frame::encoded(body)).await;
     }

@@ -9,7 +9,7 @@ use hyper::{Method, StatusCode};
 use serde_json::{Value, json};
 
 use crate::fake::{Person, csr, soon};
-use crate::{deploy, reported, signed, start, start_with_vehicle};
+use crate::{reported, signed, start, start_with_vehicle};
 
 #[tokio::test]
 async fn a_newer_connection_takes_the_place_of_an_older_one() {
@@ -66,7 +66,7 @@ async fn a_vehicle_that_is_enrolled_again_stays_connected_until_it_uses_that() {
 #[tokio::test]
 async fn no_change_is_missed_while_frames_are_handled() {
     let (_folder, server, admin, vehicle) = start_with_vehicle().await;
-    deploy(&admin, &signed(1)).await;
+    admin.deploy(&signed(1)).await;
     let (mut link, ..) = vehicle.connect().await;
     link.send(reported(1)).await;
     assert!(matches!(link.next().await, Some(Body::Desired(_))));
@@ -88,7 +88,7 @@ async fn no_change_is_missed_while_frames_are_handled() {
 async fn a_vehicle_fetches_only_deployments_that_are_for_it() {
     let (_folder, server, admin, vehicle) = start_with_vehicle().await;
     let (other, _) = admin.enrol("car-8").await;
-    let envelope = deploy(&admin, &signed(1)).await;
+    let envelope = admin.deploy(&signed(1)).await;
     let (mut link, ..) = vehicle.connect().await;
     link.send(reported(1)).await;
     assert!(matches!(link.next().await, Some(Body::Desired(_))));

@@ -13,10 +13,10 @@ mod restarts;
 
 use std::path::Path;
 
-use fake::{FakeVehicle, Person, csr, soon};
+use fake::{FakeVehicle, Person, Signed, csr, soon};
 use gleaner_cloud::{CloudServer, ServeOptions};
 use gleaner_fleet::{Body, RenewRequest, Reported, WantedProblem, compress};
-use gleaner_trust::{Deployment, Grants, Revision, RevisionFile, SecretKey, seal, sha256};
+use gleaner_trust::sha256;
 use http_body_util::BodyExt;
 use hyper::{Method, StatusCode};
 use serde_json::{Value, json};
@@ -42,63 +42,8 @@ async fn start_with_vehicle() -> (TempDir, CloudServer, Person, FakeVehicle) {
     (folder, server, admin, vehicle)
 }
 
-/// A signed deployment of a lambda with one file.
-struct Signed {
-    deployment: String,
-    revision: String,
-    digest: String,
-    file: &'static [u8],
-}
-
 fn signed(release: u64) -> Signed {
-    let (key, file) = (SecretKey::generate().unwrap(), b"content");
-    let revision = Revision {
-        name: "brake-dark".parse().unwrap(),
-        version: "1.0.0".parse().unwrap(),
-        kind: serde_json::from_value(json!("wasm")).unwrap(),
-        release: 1,
-        created: 1,
-        files: vec![RevisionFile {
-            path: "lambda.toml".parse().unwrap(),
-            bytes: file.len() as u64,
-            sha256: sha256(file),
-        }],
-    };
-    let digest = sha256(&serde_json::to_vec(&revision).unwrap());
-    let deployment = Deployment {
-        id: "brake-dark".parse().unwrap(),
-        release,
-        selector: [("fleet".parse().unwrap(), "test".to_owned())].into(),
-        revision: digest.clone(),
-        fallback: None,
-        config: [].into(),
-        grants: Grants::default(),
-        created: 1,
-        expires: 2,
-    };
-    let text = |envelope: Vec<u8>| String::from_utf8(envelope).unwrap();
-    Signed {
-        deployment: text(seal(&deployment, &[&key]).unwrap()),
-        revision: text(seal(&revision, &[&key]).unwrap()),
-        digest: digest.to_string(),
-        file,
-    }
-}
-
-/// Deploys, with the file if it is missing; returns the digest of the envelope.
-async fn deploy(person: &Person, signed: &Signed) -> String {
-    let request = json!({ "deployment": signed.deployment, "revisions": [signed.revision] });
-    let reply = person.call(Method::POST, "/v1/deployments", request.clone()).await;
-    if reply["result"] == "missing" {
-        let object = format!("/v1/objects/{}", reply["objects"][0]["sha256"].as_str().unwrap());
-        let refused = person.open(Method::PUT, &object, b"another").await.status();
-        assert_eq!(refused, StatusCode::FORBIDDEN);
-        let sent = person.open(Method::PUT, &object, signed.file).await.status();
-        assert_eq!(sent, StatusCode::NO_CONTENT);
-        let reply = person.call(Method::POST, "/v1/deployments", request).await;
-        assert_eq!(reply["result"], "accepted", "{reply}");
-    }
-    sha256(signed.deployment.as_bytes()).to_string()
+    Signed::new("brake-dark", release, None)
 }
 
 fn reported(generation: u64) -> Body {
@@ -123,14 +68,14 @@ async fn a_vehicle_enrols_gets_what_is_deployed_and_is_cut_off() {
 
     // What its labels select comes once they are reported, and with each change afterwards.
     let first = signed(1);
-    let envelope = deploy(&admin, &first).await;
+    let envelope = admin.deploy(&first).await;
     link.send(reported(1)).await;
     let Some(Body::Desired(desired)) = link.next().await else { panic!("no wanted state") };
     assert_eq!((desired.generation, &desired.deployments[0].envelope), (2, &envelope));
     for (path, expected) in [
         (format!("/v1/deployments/{envelope}"), first.deployment.as_bytes()),
         (format!("/v1/revisions/{}", first.digest), first.revision.as_bytes()),
-        (format!("/v1/objects/{}", sha256(first.file)), first.file),
+        (format!("/v1/objects/{}", sha256(&first.file)), &first.file[..]),
     ] {
         assert_eq!(vehicle.get(&path).await, (StatusCode::OK, expected.to_vec()), "{path}");
     }

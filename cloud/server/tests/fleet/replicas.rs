@@ -17,7 +17,7 @@ use tokio::time::{Duration, sleep};
 use crate::clips::{bytes, facts, orders, pull, put, report, two_parts};
 use crate::fake::{FakeLink, Person, cursor_after, soon};
 use crate::nats::NatsServer;
-use crate::{deploy, options, reported, signed};
+use crate::{options, reported, signed};
 
 /// A bus that nothing serves.
 const NO_BUS: &str = "nats://127.0.0.1:9";
@@ -38,7 +38,6 @@ async fn options_of(folder: &Path, name: &str, bus: &str) -> Option<ServeOptions
     Some(ServeOptions { data: folder.join(name), bus, objects, ..options })
 }
 
-/// Copies the authorities of a data folder to another one.
 fn copy_authorities(from: &Path, to: &Path) {
     fs::create_dir_all(to.join("ca")).unwrap();
     for entry in fs::read_dir(from.join("ca")).unwrap() {
@@ -94,12 +93,11 @@ async fn are_one_cloud(bus: &str) {
 
     // A deployment and its file come to one, and the vehicle is connected to the other one.
     let deployed = signed(1);
-    let request = json!({ "deployment": deployed.deployment, "revisions": [deployed.revision] });
-    let reply = at_two.call(Method::POST, "/v1/deployments", request.clone()).await;
+    let reply = at_two.call(Method::POST, "/v1/deployments", deployed.request()).await;
     let object = format!("/v1/objects/{}", reply["objects"][0]["sha256"].as_str().unwrap());
-    let sent = at_one.open(Method::PUT, &object, deployed.file).await.status();
+    let sent = at_one.open(Method::PUT, &object, &deployed.file).await.status();
     assert_eq!(sent, StatusCode::NO_CONTENT);
-    deploy(at_two, &deployed).await;
+    at_two.deploy(&deployed).await;
     link.send(reported(1)).await;
     assert_eq!(wanted(&mut link).await.deployments.len(), 1);
     let path = object.as_str();
@@ -178,7 +176,7 @@ async fn a_bus_that_is_killed_or_sends_nonsense_stops_nothing() {
     let [at_one, at_two] = &replicas.admins;
     let (vehicle, _) = at_one.enrol("car-7").await;
     let mut link = vehicle.connect().await.0;
-    deploy(at_two, &signed(1)).await;
+    at_two.deploy(&signed(1)).await;
     link.send(reported(1)).await;
     wanted(&mut link).await;
     for number in 0..6 {

@@ -14,7 +14,7 @@ use tempfile::TempDir;
 use tokio::time::{Duration, sleep};
 
 use crate::fake::{Person, cursor_after, soon};
-use crate::{deploy, options, postgres, reported, signed, start, start_with_vehicle};
+use crate::{options, postgres, reported, signed, start, start_with_vehicle};
 
 #[tokio::test]
 async fn a_restart_keeps_everything() {
@@ -30,7 +30,7 @@ async fn a_restart_keeps_everything() {
     let (mut vehicle, _) = admin.enrol("car-7").await;
     let (mut link, _, before) = vehicle.connect().await;
     link.record(0..2).await;
-    let envelope = deploy(&admin, &signed(1)).await;
+    let envelope = admin.deploy(&signed(1)).await;
     link.send(reported(before.generation)).await;
     assert!(link.next().await.is_some(), "a wanted state");
     link.settle().await;

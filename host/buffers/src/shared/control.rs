@@ -137,7 +137,6 @@ unsafe impl ControlMemory for Arc<ControlPage> {
     }
 }
 
-/// A control page that is mapped.
 pub(super) struct MappedControl(Box<dyn ControlMemory>);
 
 impl MappedControl {

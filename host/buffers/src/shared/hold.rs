@@ -141,7 +141,6 @@ impl HeldWindow {
         Self { samples: (0..hold.samples.len()).map(sample).collect() }
     }
 
-    /// The samples of several holds.
     pub(super) fn concat(windows: Vec<Self>) -> Self {
         Self { samples: windows.into_iter().flat_map(Self::into_samples).collect() }
     }
@@ -151,7 +150,6 @@ impl HeldWindow {
         self.samples
     }
 
-    /// The newest sample.
     pub(super) fn newest(mut self) -> HeldSample {
         self.samples.pop().expect("a hold has samples")
     }

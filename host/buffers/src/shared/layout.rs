@@ -216,7 +216,6 @@ impl SharedMemory {
         &self.model.header
     }
 
-    /// The place of a position.
     #[cfg(not(loom))]
     pub(super) fn place(&self, position: u64) -> &PlaceWords {
         let index = (position % self.layout.places() as u64) as usize;
@@ -225,7 +224,6 @@ impl SharedMemory {
         unsafe { self.base.add(size_of::<HeaderWords>()).cast::<PlaceWords>().add(index).as_ref() }
     }
 
-    /// The place of a position.
     #[cfg(loom)]
     pub(super) fn place(&self, position: u64) -> &PlaceWords {
         &self.model.places[(position % self.layout.places() as u64) as usize]

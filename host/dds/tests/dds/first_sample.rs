@@ -41,7 +41,6 @@ fn first() {
     }
 }
 
-/// The receive threads of this process.
 fn receive_threads() -> HashSet<i32> {
     let is_receiver = |path: &PathBuf| {
         fs::read_to_string(path.join("comm")).is_ok_and(|name| name == "gleaner receive\n")

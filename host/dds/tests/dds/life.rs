@@ -186,7 +186,6 @@ fn dropped() {
     });
 }
 
-/// Raises a flag when it is dropped.
 struct RaiseOnDrop<'a>(&'a AtomicBool);
 
 impl Drop for RaiseOnDrop<'_> {

@@ -53,7 +53,6 @@ pub fn spec(topic: &str, qos: Qos) -> TopicSpec {
     TopicSpec { topic: topic.to_owned(), type_name, queue: 10, max_bytes: 1 << 20, qos }
 }
 
-/// Waits until `done`.
 pub fn until(what: &str, mut done: impl FnMut() -> bool) {
     let begun = Instant::now();
     while !done() {
@@ -202,7 +201,6 @@ impl<'de> Decode<'de, Vec<u8>> for Whole {
     }
 }
 
-/// A sink that keeps its samples.
 #[derive(Default)]
 pub struct KeptSamples {
     samples: Mutex<Vec<(SampleMeta, Vec<u8>)>>,

@@ -63,7 +63,6 @@ impl PlaybackState {
     }
 }
 
-/// A drive that plays.
 pub(super) struct Playback {
     drive: Replay,
     rate: f64,

@@ -189,7 +189,6 @@ pub fn file(bytes: &[u8]) -> PathBuf {
     path
 }
 
-/// A sink that keeps its samples.
 #[derive(Default)]
 pub struct MemorySink(pub Mutex<Vec<(SampleMeta, Vec<u8>)>>);
 

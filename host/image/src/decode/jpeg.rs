@@ -144,7 +144,6 @@ fn supported(marker: u8) -> Result<(), ImageError> {
     Err(unsupported(what))
 }
 
-/// Parses a frame header.
 fn frame_of(segment: &JpegSegment<'_>) -> Result<FrameHeader, ImageError> {
     let &[precision, h1, h0, w1, w0, components, ref parts @ ..] = segment.body else {
         return Err(damaged(segment.at, "a frame header that is too short"));

@@ -8,7 +8,6 @@ use png::{BitDepth, ColorType, Decoder, DecodingError, InterlaceInfo, Limits, Tr
 use super::{Format, ImageHeader};
 use crate::error::ImageError;
 
-/// Signature of PNG.
 pub(super) const MAGIC: [u8; 8] = *b"\x89PNG\r\n\x1a\n";
 
 /// Colour type of grey pixels without alpha, in the header.

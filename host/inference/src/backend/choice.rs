@@ -26,14 +26,12 @@ pub struct ChosenGraph {
     pub built_for: Option<String>,
 }
 
-/// A library that can be chosen.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Library {
     Rten,
     OnnxRuntime,
 }
 
-/// A provider that the manifest names.
 #[derive(Debug, Clone, Copy)]
 struct NamedProvider<'a> {
     name: &'a str,

@@ -22,7 +22,6 @@ pub(super) fn numbers<T: FromBytes + Immutable + Copy>(bytes: &[u8]) -> Cow<'_, 
     }
 }
 
-/// Returns the bytes of numbers.
 pub(super) fn bytes<T: IntoBytes + Immutable>(numbers: &[T]) -> Vec<u8> {
     numbers.as_bytes().to_vec()
 }

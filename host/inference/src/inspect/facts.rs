@@ -27,7 +27,6 @@ const SAME_TYPE: &str = "Abs Add Div Exp Expand Gather MatMul Mul Pow Reshape Sq
 /// Operators whose results are booleans.
 const CONDITIONS: &str = "And Equal Greater GreaterOrEqual IsInf IsNaN Less LessOrEqual Not Or Xor";
 
-/// A node of a graph.
 #[derive(Default)]
 pub(super) struct OnnxNode<'a> {
     pub(super) operator: &'a str,
@@ -45,7 +44,6 @@ struct NodeAttribute<'a> {
     tensor: Option<ValueFacts>,
 }
 
-/// Known properties of a value.
 #[derive(Clone, Default, PartialEq)]
 pub(super) struct ValueFacts {
     /// Number of its type.
@@ -54,7 +52,6 @@ pub(super) struct ValueFacts {
     pub(super) shape: Option<Vec<i64>>,
     /// True for a constant with a number that an `int32` cannot hold.
     pub(super) is_wide: bool,
-    /// True for a constant.
     pub(super) is_constant: bool,
     /// True for a small constant of `float32` without fractions.
     pub(super) is_whole: bool,
@@ -250,7 +247,6 @@ impl<'a> GraphFacts<'a> {
         self.values.get(name)
     }
 
-    /// Returns the node that computes a value.
     pub(super) fn producer(&self, name: &str) -> Option<&OnnxNode<'a>> {
         self.producers.get(name).map(|index| &self.nodes[*index])
     }

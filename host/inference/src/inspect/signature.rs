@@ -35,7 +35,6 @@ pub struct OutputInfo {
     pub has_shape: bool,
 }
 
-/// A declared value.
 pub(super) struct DeclaredValue<'a> {
     pub(super) name: &'a str,
     pub(super) tensor: Option<DeclaredTensor>,
@@ -48,7 +47,7 @@ pub(super) struct DeclaredTensor {
     pub(super) element: Option<i64>,
     /// The first lengths, as many as a tensor may have.
     pub(super) shape: Option<Vec<i64>>,
-    /// Number of dimensions.
+    /// Number of dimensions, also of those that `shape` leaves out.
     pub(super) dimensions: usize,
 }
 

@@ -6,14 +6,12 @@
 #[error("it is no protobuf message")]
 pub(super) struct NoMessage;
 
-/// A field of a message.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct WireField<'a> {
     pub(super) number: u64,
     pub(super) value: WireValue<'a>,
 }
 
-/// The value of a field.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum WireValue<'a> {
     Varint(u64),
@@ -30,7 +28,6 @@ impl<'a> WireField<'a> {
         }
     }
 
-    /// Returns the text of a string.
     pub(super) fn text(&self) -> Result<&'a str, NoMessage> {
         std::str::from_utf8(self.bytes()?).map_err(|_| NoMessage)
     }

@@ -8,7 +8,7 @@ use clap::Parser;
 /// Runs the models of all lambdas. Standard input is the socket of a starter; reports, one JSON
 /// object per line, go to standard output.
 #[derive(Parser)]
-#[command(name = "gleaner-inference", version)]
+#[command(name = "gleaner-inference", version = gleaner_base::version())]
 pub(super) struct Args {
     /// Library of ONNX Runtime. Default, in this order: the file in the environment variable
     /// ORT_DYLIB_PATH; the newest libonnxruntime.so* in the package `onnxruntime` of the

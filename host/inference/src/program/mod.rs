@@ -31,7 +31,6 @@ use crate::region::TensorRegion;
 use crate::threads::ModelThreads;
 use args::Args;
 
-/// Folder of the threads of this process.
 const OWN_THREADS: &str = "/proc/self/task";
 
 /// Runs the program `gleaner-inference`.

@@ -15,7 +15,6 @@ pub const BOOL: i64 = 9;
 pub const FLOAT16: i64 = 10;
 pub const FLOAT64: i64 = 11;
 
-/// Returns the number of a type of elements.
 pub fn number_of(element: Element) -> i64 {
     match element {
         Element::Float32 => FLOAT32,
@@ -46,14 +45,12 @@ impl Proto {
         self.0.push(value as u8);
     }
 
-    /// Adds a number.
     pub fn number(mut self, field: u64, value: i64) -> Proto {
         self.varint(field << 3);
         self.varint(value as u64);
         self
     }
 
-    /// Adds bytes.
     pub fn bytes(mut self, field: u64, bytes: &[u8]) -> Proto {
         self.varint(field << 3 | 2);
         self.varint(bytes.len() as u64);
@@ -61,17 +58,14 @@ impl Proto {
         self
     }
 
-    /// Adds a text.
     pub fn text(self, field: u64, text: &str) -> Proto {
         self.bytes(field, text.as_bytes())
     }
 
-    /// Adds an embedded message.
     pub fn message(self, field: u64, message: &Proto) -> Proto {
         self.bytes(field, &message.0)
     }
 
-    /// Adds embedded messages.
     pub fn messages(self, field: u64, messages: &[Proto]) -> Proto {
         messages.iter().fold(self, |proto, message| proto.message(field, message))
     }
@@ -95,30 +89,25 @@ pub fn value_of(name: &str, tensor: &Proto) -> Proto {
     Proto::default().text(1, name).message(2, &Proto::default().message(1, tensor))
 }
 
-/// Returns a node.
 pub fn node(operator: &str, inputs: &[&str], outputs: &[&str], attributes: &[Proto]) -> Proto {
     let named = inputs.iter().fold(Proto::default(), |proto, name| proto.text(1, name));
     let named = outputs.iter().fold(named, |proto, name| proto.text(2, name));
     named.text(4, operator).messages(5, attributes)
 }
 
-/// Returns an attribute that is a graph.
 pub fn graph_attribute(name: &str, graph: &Proto) -> Proto {
     Proto::default().text(1, name).message(6, graph).number(20, 5)
 }
 
-/// Returns an attribute that is a number.
 pub fn number_attribute(name: &str, number: i64) -> Proto {
     Proto::default().text(1, name).number(3, number).number(20, 2)
 }
 
-/// Returns an attribute that is a list of numbers.
 pub fn numbers_attribute(name: &str, numbers: &[i64]) -> Proto {
     let attribute = Proto::default().text(1, name);
     numbers.iter().fold(attribute, |proto, number| proto.number(8, *number)).number(20, 7)
 }
 
-/// Returns a constant.
 pub fn constant(name: &str, element: i64, shape: &[i64], bytes: &[u8]) -> Proto {
     let dimensions = shape.iter().fold(Proto::default(), |proto, length| proto.number(1, *length));
     dimensions.number(2, element).text(8, name).bytes(9, bytes)
@@ -131,13 +120,11 @@ pub fn external(name: &str, location: &str) -> Proto {
     tensor.message(13, &entry).number(14, 1)
 }
 
-/// Returns a graph.
 pub fn graph(nodes: &[Proto], constants: &[Proto], inputs: &[Proto], outputs: &[Proto]) -> Proto {
     let nodes = Proto::default().messages(1, nodes).text(2, "test");
     nodes.messages(5, constants).messages(11, inputs).messages(12, outputs)
 }
 
-/// Returns a model.
 pub fn model(graph: &Proto) -> Vec<u8> {
     model_with_opset(graph, 17)
 }

@@ -16,7 +16,6 @@ pub fn library() -> Option<String> {
     library
 }
 
-/// Returns whether this machine has a GPU of NVIDIA.
 fn has_gpu() -> bool {
     std::path::Path::new("/dev/nvidiactl").exists()
 }

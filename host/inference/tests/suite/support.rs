@@ -132,7 +132,6 @@ impl ModelProgram {
         self.child.id()
     }
 
-    /// Waits for a report.
     pub fn report<T>(&self, mut find: impl FnMut(InferenceReport) -> Option<T>) -> T {
         loop {
             if let Some(found) = find(self.reports.recv_timeout(TIMEOUT).expect("a report")) {
@@ -201,7 +200,6 @@ impl Drop for ModelProgram {
     }
 }
 
-/// A tensor of a test.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TestTensor {
     pub name: String,
@@ -210,13 +208,11 @@ pub struct TestTensor {
     pub bytes: Vec<u8>,
 }
 
-/// Returns a tensor of floats.
 pub fn floats(name: &str, shape: &[u32], values: &[f32]) -> TestTensor {
     let bytes = values.iter().flat_map(|value| value.to_le_bytes()).collect();
     TestTensor { name: name.to_owned(), element: Element::Float32, shape: shape.to_vec(), bytes }
 }
 
-/// Returns a tensor of 64-bit integers.
 pub fn integers(name: &str, shape: &[u32], values: &[i64]) -> TestTensor {
     let bytes = values.iter().flat_map(|value| value.to_le_bytes()).collect();
     TestTensor { name: name.to_owned(), element: Element::Int64, shape: shape.to_vec(), bytes }
@@ -234,7 +230,6 @@ impl TestTensor {
     }
 }
 
-/// An opened model.
 #[derive(Debug)]
 pub struct OpenedModel {
     pub inputs: Vec<TensorInfo>,
@@ -373,7 +368,6 @@ pub fn fault<T: std::fmt::Debug>(kind: ModelFaultKind, result: Result<T, ModelFa
     fault.message
 }
 
-/// Waits until `find` returns something.
 pub fn wait_for<T>(mut find: impl FnMut() -> Option<T>) -> T {
     let until = Instant::now() + TIMEOUT;
     loop {

@@ -15,7 +15,8 @@ use super::topics::TopicsArgs;
 /// Standard input is the socket of a starter; reports, one JSON object per line, go to standard
 /// output.
 #[derive(Parser)]
-#[command(name = "gleaner-ingress", version, args_conflicts_with_subcommands = true)]
+#[command(name = "gleaner-ingress", version = gleaner_base::version())]
+#[command(args_conflicts_with_subcommands = true)]
 pub(super) struct Args {
     #[command(subcommand)]
     pub(super) command: Option<IngressCommand>,
@@ -61,7 +62,6 @@ impl Args {
         self.clock_offset.map_or_else(Clock::from_time_of_day, Clock::new)
     }
 
-    /// Returns whether samples come from the network.
     pub(super) fn is_of_network(&self) -> bool {
         self.drive.is_empty()
     }

@@ -71,7 +71,6 @@ impl RunningIngress {
         Feed::connect(self.control().add_reader(&add).unwrap()).unwrap()
     }
 
-    /// Waits for a report.
     pub fn report<T>(&self, mut find: impl FnMut(IngressReport) -> Option<T>) -> T {
         let until = Instant::now() + TIMEOUT;
         loop {
@@ -191,7 +190,6 @@ pub fn grant(id: u32, topic: &str) -> TopicGrant {
     }
 }
 
-/// Waits until `find` returns something.
 pub fn wait_for<T>(mut find: impl FnMut() -> Option<T>) -> T {
     let until = Instant::now() + TIMEOUT;
     loop {

@@ -11,7 +11,6 @@ use gleaner_transport::Transport;
 
 use super::support::sample_drive;
 
-/// A folder for one test, removed when dropped.
 struct DefinitionsFolder(PathBuf);
 
 impl DefinitionsFolder {
@@ -217,5 +216,5 @@ fn the_error_names_an_invalid_file() {
     assert!(matches!(sources.find("p/msg/Two"), Err(SourcesError::Several { .. })));
     assert!(matches!(sources.find("p/msg/Big"), Err(SourcesError::NotText { .. })));
     assert!(matches!(sources.find("p/msg/Latin"), Err(SourcesError::NotText { .. })));
-    assert_eq!(sources.find("p/msg/DefinitionsFolder").unwrap(), None);
+    assert_eq!(sources.find("p/msg/Folder").unwrap(), None);
 }

@@ -62,7 +62,6 @@ impl ClipDir {
         self.signer.get()
     }
 
-    /// Counts a clip that could not be signed.
     pub(super) fn count_unsigned(&self) {
         self.unsigned.fetch_add(1, Ordering::Relaxed);
     }
@@ -88,7 +87,6 @@ impl ClipDir {
         self.path(name, suffix).symlink_metadata().is_ok()
     }
 
-    /// Adds a complete clip to the list.
     pub(super) fn add(&self, name: &str, clip: &Clip) -> Result<(), RecordError> {
         self.list.append(clip)?;
         self.take(name);

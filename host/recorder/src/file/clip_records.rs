@@ -18,9 +18,7 @@ pub(super) const LIBRARY: &str = concat!("gleaner ", env!("CARGO_PKG_VERSION"));
 pub(super) const BEGIN: &str = "gleaner.begin";
 /// The record with the line of the list.
 pub(super) const CLIP_RECORD: &str = "gleaner.clip";
-/// The record of a topic.
 pub(super) const TOPIC_RECORD: &str = "gleaner.topic";
-/// The record of a lambda.
 pub(super) const LAMBDA_RECORD: &str = "gleaner.lambda";
 /// The record of a trigger or a command.
 pub(super) const DECISION_RECORD: &str = "gleaner.decision";
@@ -36,7 +34,6 @@ pub(crate) const CONTINUES: &str = "continues the clip before";
 
 const UNKNOWN: &str = "unknown";
 
-/// A metadata record.
 pub(super) type MetadataRecord = (String, BTreeMap<String, String>);
 
 /// Returns the line of a clip, except for its length.
@@ -151,7 +148,6 @@ pub(super) fn records<'a>(
         .chain(trailer.moments.iter().map(decision))
 }
 
-/// Returns the record of the clip as a whole.
 pub(super) fn about_clip(
     clip: &Clip,
     clock: &str,

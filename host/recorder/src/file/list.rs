@@ -18,7 +18,6 @@ use crate::error::RecordError;
 /// bytes for each if they are control characters, and 100 moments of some 3 KB.
 const LINE_MAX: u64 = 16 << 20;
 
-/// The list of clips.
 pub(super) struct ClipList {
     path: PathBuf,
     folder: PathBuf,

@@ -17,7 +17,6 @@ pub(super) enum Origin {
     Foreign,
 }
 
-/// Returns the writer of the file `path`.
 pub(super) fn origin(path: &Path) -> io::Result<Origin> {
     let header = header();
     let mut file = BufReader::new(safe_file::read(path)?);

@@ -25,7 +25,6 @@ pub(super) struct EarlyEnd {
     pub(super) why: Damage,
 }
 
-/// A clip that is being read.
 struct ClipReader {
     replay: Replay,
     last: Arc<LastMessage>,

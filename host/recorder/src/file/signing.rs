@@ -81,7 +81,6 @@ fn parsed<T: std::str::FromStr<Err: ToString>>(text: &str) -> Result<T, Refusal>
     })
 }
 
-/// Returns the losses of all topics.
 fn losses(clip: &Clip) -> ClipLosses {
     let sum = |count: fn(&ClipTopic) -> Option<u64>| {
         clip.topics

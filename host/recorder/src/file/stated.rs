@@ -28,7 +28,6 @@ use crate::{LAMBDAS_MAX, lambda_digest};
 /// Values of a metadata record.
 type Values = BTreeMap<String, String>;
 
-/// The records of a clip.
 const RECORDS: [&str; 5] = [BEGIN, CLIP_RECORD, TOPIC_RECORD, LAMBDA_RECORD, DECISION_RECORD];
 
 /// Number of bytes to show of the common part of two long texts, before their first difference.

@@ -84,7 +84,6 @@ struct TopicChannels {
 #[derive(Copy, Clone, Default, PartialEq, Eq, Hash)]
 struct ChannelKey {
     writer: Option<Guid>,
-    /// Number of the layout.
     layout: u16,
     is_latched: bool,
 }
@@ -96,7 +95,6 @@ impl ChannelKey {
     }
 }
 
-/// The channel of a message.
 struct ClipChannel {
     /// Index in [`Written::topics`].
     index: usize,
@@ -319,7 +317,6 @@ impl UnfinishedClip {
         ready.inspect_err(|error| signing::failed(&self.dir, clip, error)).ok()
     }
 
-    /// Returns the number of messages written.
     pub(super) fn messages(&self) -> u64 {
         self.written.messages()
     }

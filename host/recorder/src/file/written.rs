@@ -8,7 +8,6 @@ use gleaner_transport::SampleMeta;
 
 use super::TopicSchema;
 
-/// A topic of a clip.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(super) struct WrittenTopic {
     pub(super) name: String,
@@ -77,7 +76,6 @@ impl Written {
         self.span = Some((first.min(meta.at_ns), last.max(meta.at_ns)));
     }
 
-    /// Returns the topic of this name.
     pub(super) fn topic(&self, name: &str) -> Option<&WrittenTopic> {
         self.by_name.get(name).map(|index| &self.topics[*index])
     }

@@ -306,7 +306,6 @@ impl Preroll {
         }
     }
 
-    /// Returns the oldest entry.
     fn oldest(&self) -> Option<EntryId> {
         match &self.kind {
             PrerollStore::Ram(ram) => ram.oldest(),
@@ -314,7 +313,6 @@ impl Preroll {
         }
     }
 
-    /// Returns the entry after this one.
     fn after(&self, place: EntryId) -> Option<EntryId> {
         match &self.kind {
             PrerollStore::Ram(ram) => ram.after(place),

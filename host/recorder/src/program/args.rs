@@ -13,7 +13,7 @@ use super::RecorderOptions;
 /// Records for lambdas from live topics, which it reads from the ingress. Its standard input is a
 /// socket of the starter; reports, one JSON object per line, go to standard output.
 #[derive(Parser)]
-#[command(name = "gleaner-recorder", version)]
+#[command(name = "gleaner-recorder", version = gleaner_base::version())]
 pub struct Args {
     /// Output folder: `clips.jsonl`, `clips/`.
     #[arg(long, value_name = "FOLDER")]

@@ -14,7 +14,6 @@ use tracing::warn;
 
 use super::connections::LoopEvent;
 
-/// Interval of the checks.
 const HEALTH_INTERVAL: Duration = Duration::from_secs(1);
 
 /// A request to search the definitions of a topic on this machine.

@@ -142,7 +142,6 @@ pub fn run(
     ended
 }
 
-/// The state of the loop.
 struct RecorderLoop {
     recorder: Recorder,
     clock: Clock,

@@ -9,13 +9,11 @@ use tracing::{error, warn};
 use super::report_writer::ReportWriter;
 use crate::Recorder;
 
-/// Interval of the status.
 const INTERVAL: Duration = Duration::from_secs(1);
 
 /// Reports what is new since its last report.
 pub struct Reporter {
     reports: ReportWriter,
-    /// Clips so far.
     clips: u64,
     /// Triggers so far that were suppressed, and reported.
     disk_suppressed: u64,

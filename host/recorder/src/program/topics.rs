@@ -371,7 +371,6 @@ impl GrantedTopic {
     }
 }
 
-/// Returns the reason for a refusal as text.
 fn in_words(reason: &RefusedTopic) -> String {
     match reason {
         RefusedTopic::NoSuchTopic { .. } => "there is no such topic".to_owned(),

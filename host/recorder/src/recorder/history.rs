@@ -40,7 +40,6 @@ pub struct History {
     noticed_at: i64,
 }
 
-/// Losses of the samples of a topic.
 #[derive(Default)]
 struct TopicLosses {
     losses: Losses,

@@ -34,7 +34,6 @@ pub struct LambdaSpec {
     pub topics: Vec<TopicId>,
 }
 
-/// A recorded topic.
 #[derive(Debug)]
 struct SourceTopic {
     schema: Arc<TopicSchema>,

@@ -23,7 +23,6 @@ pub enum TriggerOutcome {
     TooManyWaiting,
 }
 
-/// The origin of a trigger.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum TriggeredBy {
     Lambda,

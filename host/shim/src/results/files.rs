@@ -14,7 +14,6 @@ use super::sink::{ProcessResults, ResultSink};
 /// Longest time that lines wait, and shortest time between two attempts to open the files.
 const FLUSH: Duration = Duration::from_millis(500);
 
-/// The result files in a folder.
 pub(crate) struct ResultFiles {
     folder: PathBuf,
     /// The files, once they are open.
@@ -42,7 +41,6 @@ impl ResultFiles {
         Ok(Self { folder, output, tried: None, without_file: 0, has_pending: false })
     }
 
-    /// Writes lines to the files.
     fn put(
         &mut self,
         put: impl FnOnce(&mut Output) -> Result<(), OutputError>,
@@ -107,7 +105,6 @@ impl ResultSink for ResultFiles {
     }
 }
 
-/// Opens the result files in `folder`.
 fn open_output(folder: &Path, again: bool) -> Result<Output, OutputError> {
     Ok(Output::begin(folder, true, again)?.with_log_rotation(LIVE_LOG_MAX.bytes()))
 }

@@ -17,7 +17,6 @@ use super::sink::{ProcessResults, ResultSink};
 /// Bytes read in a turn; further ones stay in the pipe. No healthy lambda sends 16 MiB or 65,000
 /// lines a second, and a flood must not take a core or the disk from others.
 const TURN_BYTES: usize = 1600 << 10;
-/// The length of a turn.
 const TURN: Duration = Duration::from_millis(100);
 /// Bytes that are still read after the runtime has ended. A pipe holds 1 MiB, unless root allowed
 /// more.

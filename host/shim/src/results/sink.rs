@@ -14,13 +14,10 @@ pub(crate) trait ResultSink: Send {
     /// Called once, before the lambda is entered.
     fn begin(&mut self) -> Result<(), Failure>;
 
-    /// Takes a decision.
     fn decision(&mut self, decision: Box<Decision>) -> Result<(), Failure>;
 
-    /// Takes a log line.
     fn log(&mut self, line: LogLine) -> Result<(), Failure>;
 
-    /// Returns whether items wait.
     fn has_pending(&self) -> bool;
 
     /// Returns whether too many items wait.

@@ -27,7 +27,6 @@ const BUSY: Duration = Duration::from_secs(5);
 /// sends invalid items for months must not fill its spool with their counts.
 const LOSSES: Duration = Duration::from_secs(10);
 
-/// The spool of a lambda.
 pub(crate) struct ResultSpool {
     writer: SpoolWriter,
     /// Bytes at which waiting records are written.

@@ -30,7 +30,6 @@ fn shim(out: &Path, script: &str) -> Command {
     shim
 }
 
-/// Runs `script` to its end.
 fn run(folder: &ResultsFolder, script: &str) -> Output {
     shim(&folder.out(), script).output().unwrap()
 }

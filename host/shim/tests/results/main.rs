@@ -27,7 +27,6 @@ last() { item '{"last":{"lambda":"l","version":"1.0.0","kind":"wasm","out":"o","
 '"rss_bytes":0,"cpu_s":0.0}}'; }
 "#;
 
-/// A folder for one test, removed when dropped.
 struct ResultsFolder(PathBuf);
 
 impl ResultsFolder {

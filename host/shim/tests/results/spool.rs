@@ -32,7 +32,6 @@ fn shim(spool: &Path, start: u32, more: &[&str], script: &str) -> Command {
     shim
 }
 
-/// Runs `script` to its end.
 fn run(folder: &ResultsFolder, more: &[&str], script: &str) -> Output {
     shim(&folder.out(), 0, more, script).output().unwrap()
 }
@@ -184,7 +183,6 @@ struct Follower {
 }
 
 impl Follower {
-    /// Reads all that is there.
     fn read(&mut self, spool: &Path) {
         if self.reader.is_none() {
             self.reader = SpoolReader::open(spool, STREAM, Some(0)).ok();

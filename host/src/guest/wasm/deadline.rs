@@ -53,7 +53,6 @@ impl CallTime {
     }
 }
 
-/// A running call.
 pub(super) struct ArmedCall<'a> {
     deadline: &'a Deadline,
     started: Instant,

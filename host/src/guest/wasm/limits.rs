@@ -48,7 +48,6 @@ impl Caps {
         self.refused = None;
     }
 
-    /// The last refusal.
     pub(super) fn refused(&self) -> Option<RefusedGrowth> {
         self.refused
     }

@@ -144,14 +144,7 @@ impl Guest for WasmGuest {
             .map_or_else(|| self.session.clone().during_init(|| self.start()), Ok)
         {
             Ok(live) => live,
-            Err(fault) => {
-                return WakeOutcome {
-                    result: Err(fault),
-                    fuel: None,
-                    run_ns: None,
-                    model_ns: None,
-                };
-            }
+            Err(fault) => return WakeOutcome::faulted(fault),
         };
         let deadline = self.deadline.as_ref().map(|deadline| (deadline, self.limits.deadline));
         let mut call = GuestCall::begin(&mut live.store, self.limits.fuel, deadline);

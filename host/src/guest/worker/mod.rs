@@ -55,7 +55,6 @@ enum WorkerMessage {
     Curve(Curve),
 }
 
-/// Outcome of a call into the lambda.
 #[derive(Debug, Default, Serialize, Deserialize)]
 struct CallOutcome {
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -73,7 +72,6 @@ struct CallOutcome {
     resident_bytes: u64,
 }
 
-/// The outcome of one wake.
 #[derive(Debug, Serialize, Deserialize)]
 struct WakeMessage {
     at_ns: i64,

@@ -25,7 +25,6 @@ const UNTIL_KILLED: Duration = Duration::from_secs(2);
 /// lambda.
 const BUFFERED_MAX: usize = 4 << 20;
 
-/// A worker that was started.
 pub(super) struct WorkerProcess {
     shim: Child,
     /// `None` once they are not read any more.
@@ -80,7 +79,6 @@ impl Read for PollingReader {
     }
 }
 
-/// Exit of a worker.
 pub(super) struct WorkerExit {
     /// The record of the shim, if it could send one.
     pub(super) record: Option<ExitRecord>,
@@ -134,7 +132,6 @@ impl WorkerProcess {
         Ok(Self { shim, messages, line: Vec::new(), record: None, is_ready, is_explained })
     }
 
-    /// Waits for the next message.
     pub(super) fn next(&mut self) -> Result<WorkerMessage, NoMessage> {
         let Some(messages) = &mut self.messages else { return Err(NoMessage::Ended) };
         loop {

@@ -262,24 +262,12 @@ impl Guest for RemoteGuest {
     fn wake(&mut self, wake: Wake) -> WakeOutcome {
         let WakeMessage { run_ns, model_ns, call, triggers, looked, .. } = match self.woken(&wake) {
             Ok(woken) => woken,
-            Err(fault) => {
-                return WakeOutcome {
-                    result: Err(fault),
-                    fuel: None,
-                    run_ns: None,
-                    model_ns: None,
-                };
-            }
+            Err(fault) => return WakeOutcome::faulted(fault),
         };
         for trigger in triggers {
             if let Err(error) = self.session.relay_trigger(trigger) {
                 let fault = self.killed(Some(&format!("an invalid trigger: {error}")));
-                return WakeOutcome {
-                    result: Err(fault),
-                    fuel: None,
-                    run_ns: None,
-                    model_ns: None,
-                };
+                return WakeOutcome::faulted(fault);
             }
         }
         for (topic, back) in self.session.inputs().iter().zip(looked) {

@@ -174,7 +174,6 @@ struct ClipVerifyLoop<'a> {
     is_live: bool,
     /// Losses that the clip states.
     losses: Option<String>,
-    /// The triggers of the journal.
     triggers: JournalTriggers,
 }
 

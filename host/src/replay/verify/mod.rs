@@ -117,7 +117,6 @@ impl Rerun {
         ))
     }
 
-    /// Runs a wake.
     fn wake(&mut self, wake: Wake) -> &JournalEntry {
         self.entry_builder.begin(&wake);
         let decision = self.invoker.invoke(wake);

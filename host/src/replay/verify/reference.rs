@@ -50,7 +50,6 @@ impl ReferenceJournal {
         Ok(reference)
     }
 
-    /// Returns whether the journal was written live.
     pub(super) fn is_live(&self) -> bool {
         self.header().clock != CLOCK_OF_DRIVE
     }

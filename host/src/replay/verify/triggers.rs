@@ -31,7 +31,6 @@ impl JournalTriggers {
         Self { lambda: lambda.to_owned(), count: 0, moments: Vec::new(), span: None }
     }
 
-    /// Adds the triggers of a wake.
     pub(super) fn add(&mut self, entry: &JournalEntry) {
         let (first, _) = self.span.unwrap_or((entry.at_ns, entry.at_ns));
         self.span = Some((first, entry.at_ns));

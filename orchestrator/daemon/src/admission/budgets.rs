@@ -58,7 +58,6 @@ impl Resource {
         }
     }
 
-    /// Returns the way out.
     fn help(self) -> &'static str {
         match self {
             Self::Memory => {
@@ -225,7 +224,6 @@ impl Budgets {
         self.0.iter().map(of).collect()
     }
 
-    /// Returns the demand of one lambda for each resource.
     pub(crate) fn demand(&self, demand: &LambdaDemand) -> Vec<ResourceDemand> {
         self.0.iter().map(|budget| budget.resource.of(demand)).collect()
     }

@@ -60,7 +60,6 @@ impl DemandSource {
     }
 }
 
-/// An amount of a resource, and its origin.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Asked {
     pub(crate) amount: f64,
@@ -100,7 +99,6 @@ impl Asked {
     }
 }
 
-/// The demand of a lambda for all resources.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct LambdaDemand {
     /// Memory, in bytes.

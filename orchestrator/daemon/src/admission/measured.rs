@@ -111,7 +111,6 @@ impl Measurements {
         DemandModel { fuel_per_s, uses: &self.now.uses, models: &self.now.models }
     }
 
-    /// Returns whether the speed of this machine was measured.
     pub(crate) fn has_speed_of(&self, machine: &str) -> bool {
         self.now.machine.as_ref().is_some_and(|(known, _)| known == machine)
     }
@@ -167,7 +166,6 @@ impl Measurements {
         is_complete
     }
 
-    /// Returns what all lambdas use now.
     pub(crate) fn current(&self, status: &SupervisorStatus) -> CurrentUse {
         let uses: Vec<_> = self.windows.values().filter_map(Window::current).collect();
         let sum = |part: fn(&MeasuredUse) -> f64| {

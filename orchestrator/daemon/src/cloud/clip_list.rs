@@ -254,7 +254,6 @@ fn digest(mut file: PlainFile, is_over: &dyn Fn() -> bool) -> io::Result<String>
     }
 }
 
-/// Returns the builds of all deployments of the vehicle.
 pub(super) fn known_builds(core: &Core) -> Vec<KnownBuild> {
     let deployments = core.lock().state.deployments.clone();
     let mut known = Vec::new();

@@ -40,7 +40,6 @@ pub(super) struct ClipSender {
 }
 
 impl ClipSender {
-    /// Creates the task.
     pub(super) fn new(
         core: Arc<Core>,
         folder: ClipFolder,

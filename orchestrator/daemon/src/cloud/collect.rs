@@ -63,19 +63,16 @@ impl CollectedLines {
         (count > 0).then_some((lines, count))
     }
 
-    /// Returns the length of all lines.
     pub(super) fn bytes(&self) -> usize {
         self.lines.len()
     }
 
-    /// Returns their number.
     pub(super) fn count(&self) -> u64 {
         self.count
     }
 }
 
 impl TailLease {
-    /// Returns the lease of a frame.
     pub(super) fn of(tail: Tail, now: Instant) -> Self {
         let streams = tail.streams.into_iter().take(TAIL_STREAMS_MAX);
         let streams = streams.filter(|name| name.len() <= STREAM_NAME_MAX).collect();
@@ -83,7 +80,6 @@ impl TailLease {
         Self { streams, until: Some(until) }
     }
 
-    /// Returns whether a stream is read.
     pub(super) fn has(&self, stream: &str, now: Instant) -> bool {
         !self.is_over(now) && self.streams.contains(stream)
     }

@@ -23,7 +23,6 @@ const ATTEMPTS: u32 = 5;
 /// Pause after the first attempt; it doubles.
 const PAUSE: Duration = Duration::from_secs(1);
 
-/// A file to download.
 pub(super) struct Download<'d> {
     pub(super) http: &'d CloudHttp,
     pub(super) sha256: &'d Sha256,

@@ -38,10 +38,8 @@ pub(super) struct FakeCloud {
     acceptor: TlsAcceptor,
 }
 
-/// A connection that it has accepted.
 pub(super) struct FakeConnection(TlsStream<TcpStream>);
 
-/// The control channel of a vehicle.
 pub(super) struct ControlChannel(WebSocketStream<TlsStream<TcpStream>>);
 
 /// Answers by path: each a head and a body.

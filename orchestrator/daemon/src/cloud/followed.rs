@@ -24,6 +24,26 @@ impl Core {
         if followed.authority == authority { followed.generation } else { 0 }
     }
 
+    /// Makes local what another cloud than that of this authority has deployed. This one does not
+    /// know it, and would end it.
+    ///
+    /// # Errors
+    ///
+    /// A failure if it cannot be made durable.
+    pub(crate) fn leave_other_cloud(&self, authority: &str) -> Result<(), Failure> {
+        let mut inner = self.lock();
+        let before = &inner.state.followed.authority;
+        if before.is_empty() || before == authority {
+            return Ok(());
+        }
+        let mut state = inner.state.clone();
+        state.followed = FollowedState { authority: authority.to_owned(), generation: 0 };
+        state.deployments.values_mut().for_each(|deployed| deployed.cloud = None);
+        self.change(&mut inner, state)?;
+        self.publish(&mut inner);
+        Ok(())
+    }
+
     /// Remembers the newest state of a cloud that was followed.
     ///
     /// # Errors

@@ -2,12 +2,14 @@
 
 use std::future::Future;
 use std::io;
+use std::iter;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use axum::body::Bytes;
 use futures_util::{Stream, StreamExt, TryStreamExt};
 use gleaner_base::{Exit, Failure};
+use gleaner_fleet::{CAUSES_MAX, problem_text};
 use gleaner_protocol::vehicle_api::Problem;
 use http_body_util::{BodyDataStream, Full};
 use hyper::body::Incoming;
@@ -87,7 +89,7 @@ impl CloudHttp {
     ) -> Result<T, Failure> {
         let body = serde_json::to_vec(body).expect("a request is plain data");
         let whole = self.in_time("it did not answer in full", async {
-            let answer = self.request(Method::POST, path, body).await?;
+            let answer = self.request(PATIENCE, Method::POST, path, body).await?;
             self.whole(answer, ANSWER_MAX).await
         });
         self.parsed(&whole.await??)
@@ -104,7 +106,7 @@ impl CloudHttp {
         body: Vec<u8>,
     ) -> Result<T, Failure> {
         let sent = timeout(SENDING, async {
-            let answer = self.request_within(SENDING, Method::PUT, path, body).await?;
+            let answer = self.request(SENDING, Method::PUT, path, body).await?;
             self.whole(answer, ANSWER_MAX).await
         });
         let whole = sent.await.map_err(|late| self.unreachable("it did not answer", &late))??;
@@ -122,7 +124,7 @@ impl CloudHttp {
     ///
     /// A failure if there is none, or it is longer.
     pub(super) async fn get(&self, path: &str, most: u64) -> Result<Vec<u8>, Failure> {
-        let answer = self.request(Method::GET, path, Vec::new()).await?;
+        let answer = self.request(PATIENCE, Method::GET, path, Vec::new()).await?;
         self.whole(answer, most).await
     }
 
@@ -155,15 +157,6 @@ impl CloudHttp {
     }
 
     async fn request(
-        &self,
-        method: Method,
-        path: &str,
-        body: Vec<u8>,
-    ) -> Result<Response<Incoming>, Failure> {
-        self.request_within(PATIENCE, method, path, body).await
-    }
-
-    async fn request_within(
         &self,
         patience: Duration,
         method: Method,
@@ -239,13 +232,15 @@ impl CloudHttp {
         };
         let mut failure =
             Failure::new(exit, format!("the cloud at {} refuses a request", self.address));
-        failure.causes = vec![match self.whole(answer, ANSWER_MAX).await {
-            Ok(body) => match serde_json::from_slice::<Problem>(&body) {
-                Ok(problem) => gleaner_base::excerpt(&Failure::from(problem).to_string()),
-                Err(_) => format!("it answers {status}"),
-            },
-            Err(_) => format!("it answers {status}"),
-        }];
+        let answer = self.whole(answer, ANSWER_MAX).await.unwrap_or_default();
+        match serde_json::from_slice::<Problem>(&answer) {
+            Ok(Problem { title, causes, help, .. }) => {
+                let causes = iter::once(title).chain(causes).take(CAUSES_MAX);
+                failure.causes = causes.map(|cause| problem_text(&cause)).collect();
+                failure.help = help.map(|help| problem_text(&help));
+            }
+            Err(_) => failure.causes = vec![format!("it answers {status}")],
+        }
         failure
     }
 

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use gleaner_base::{Exit, Failure};
+use gleaner_base::{Exit, Failure, visible};
 use gleaner_protocol::supervision::EventKind;
 use tokio::sync::watch;
 use tokio::time::timeout;
@@ -71,7 +71,7 @@ impl CloudLink {
             let wait = match ended {
                 Ok(SessionEnd::Changed) => continue,
                 Ok(SessionEnd::Away(after, reason)) => {
-                    self.api.cloud.set_state(LinkState::Connecting, Some(reason));
+                    self.api.cloud.set_state(LinkState::Connecting, Some(reason), None);
                     after + part_of(PAUSE)
                 }
                 Err(_) if settings.has_changed().unwrap_or(false) => continue,
@@ -115,22 +115,30 @@ impl CloudLink {
         let Api { core, cloud, name, .. } = &self.api;
         let renewed = cloud.renew(core, name, (http, settings)).await;
         if let Err(failure) = renewed {
-            let text = format!("the certificate for the cloud is not renewed: {failure}");
+            let text =
+                format!("the certificate for the cloud is not renewed: {}", in_words(&failure));
             self.api.core.event(EventKind::Warning, None, &text);
         }
     }
 
     /// Notes the end of a connection; a refusal makes an event.
     fn note(&self, failure: &Failure) {
-        let (state, reason) = match failure.exit {
-            Exit::Denied => (LinkState::Refused, failure.to_string()),
-            _ => (LinkState::Connecting, failure.to_string()),
+        let state = match failure.exit {
+            Exit::Denied => LinkState::Refused,
+            _ => LinkState::Connecting,
         };
+        let reason = in_words(failure);
         if state == LinkState::Refused && self.api.cloud.lock().state != LinkState::Refused {
             self.api.core.event(EventKind::Warning, None, &reason);
         }
-        self.api.cloud.set_state(state, Some(reason));
+        self.api.cloud.set_state(state, Some(reason), failure.help.clone());
     }
+}
+
+/// Returns the failed action and its causes in one line.
+fn in_words(failure: &Failure) -> String {
+    let parts = std::iter::once(&failure.message).chain(&failure.causes);
+    parts.map(|part| visible(part)).collect::<Vec<_>>().join(": ")
 }
 
 /// Returns a random part of a pause.

@@ -36,7 +36,7 @@ mod uplink;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
-use gleaner_base::{Exit, Failure};
+use gleaner_base::{Exit, Failure, excerpt, visible};
 use gleaner_protocol::vehicle_api::CloudStatus;
 use tokio::sync::watch;
 
@@ -57,6 +57,7 @@ pub(crate) struct Cloud {
 struct LinkView {
     state: LinkState,
     reason: Option<String>,
+    help: Option<String>,
     since: Instant,
     generation: u64,
     unsent: u64,
@@ -89,6 +90,7 @@ impl Cloud {
         let shared = LinkView {
             state: LinkState::Connecting,
             reason: None,
+            help: None,
             since: Instant::now(),
             generation: 0,
             unsent: 0,
@@ -109,6 +111,7 @@ impl Cloud {
             address: settings.address,
             state: shared.state.as_str().to_owned(),
             reason: shared.reason.clone(),
+            help: shared.help.clone(),
             since_s: shared.since.elapsed().as_secs_f64(),
             generation: shared.generation,
             unsent: shared.unsent,
@@ -135,22 +138,42 @@ impl Cloud {
         self.file.save(&settings)?;
         self.settings.send_replace(Some(settings));
         // A refusal was one of the former settings.
-        self.set_state(LinkState::Connecting, None);
+        self.set_state(LinkState::Connecting, None, None);
         Ok(())
     }
 
     fn has_ended(&self) {
         if self.lock().state == LinkState::Connected {
-            self.set_state(LinkState::Connecting, None);
+            self.set_state(LinkState::Connecting, None, None);
         }
     }
 
-    fn set_state(&self, state: LinkState, reason: Option<String>) {
+    /// Sets the number of records that were not sent. It lacks the `unreadable` streams, which come
+    /// with the causes: the reason names them while the vehicle is connected.
+    fn set_unsent<'s>(
+        &self,
+        unsent: u64,
+        mut unreadable: impl Iterator<Item = (&'s String, &'s String)>,
+    ) {
+        let reason = unreadable.next().map(|(name, cause)| {
+            let (name, others) = (excerpt(name), unreadable.count());
+            let others = if others > 0 { format!(" (and {others} more)") } else { String::new() };
+            let cause = visible(cause);
+            format!("stream `{name}`{others} cannot be sent, and is not counted: {cause}")
+        });
+        let mut shared = self.lock();
+        shared.unsent = unsent;
+        if shared.state == LinkState::Connected {
+            shared.reason = reason;
+        }
+    }
+
+    fn set_state(&self, state: LinkState, reason: Option<String>, help: Option<String>) {
         let mut shared = self.lock();
         if shared.state != state {
             shared.since = Instant::now();
         }
-        (shared.state, shared.reason) = (state, reason);
+        (shared.state, shared.reason, shared.help) = (state, reason, help);
     }
 
     fn lock(&self) -> MutexGuard<'_, LinkView> {

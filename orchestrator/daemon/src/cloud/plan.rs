@@ -71,8 +71,10 @@ pub(super) fn plan(
         let wish = CloudWish { envelope, is_wanted, rollback, start };
         let followed = deployed.get(&id).and_then(|it| it.cloud.as_ref());
         let same = followed.filter(|before| before.envelope == wish.envelope);
+        let stays_stopped = !wish.is_wanted && same.is_some_and(|same| !same.is_wanted);
         let step = match (followed, same) {
-            _ if followed == Some(&wish) => None,
+            // A request for the fallback of a stopped one is followed at its start.
+            _ if followed == Some(&wish) || stays_stopped => None,
             (_, Some(same)) if same.is_wanted && wish.is_wanted => {
                 if wish.rollback > same.rollback {
                     Some(Step::RollBack(id.clone(), wish))
@@ -84,7 +86,10 @@ pub(super) fn plan(
                 let rolls_back = wish.rollback > same.map_or(0, |same| same.rollback);
                 Some(Step::Deploy { id: id.clone(), wish, rolls_back })
             }
-            (Some(_), _) => Some(Step::Stop(id.clone(), wish)),
+            (Some(_), _) => {
+                let rollback = same.map_or(0, |same| same.rollback);
+                Some(Step::Stop(id.clone(), CloudWish { rollback, ..wish }))
+            }
             // It never ran by the cloud, and is not to.
             (None, _) => None,
         };
@@ -181,6 +186,12 @@ mod tests {
         let stopped = [("a", Some(wish("1", false, 0)))];
         let start = Step::Deploy { id: id("a"), wish: wish("1", true, 0), rolls_back: false };
         assert_eq!(steps(&[wanted("a", "1", true, 0)], &stopped), [start]);
+        // Its fallback is requested at the stop or later: it is what starts.
+        let stop = Step::Stop(id("a"), wish("1", false, 0));
+        assert_eq!(steps(&[wanted("a", "1", false, 1)], &running), [stop]);
+        assert_eq!(steps(&[wanted("a", "1", false, 1)], &stopped), []);
+        let start = Step::Deploy { id: id("a"), wish: wish("1", true, 1), rolls_back: true };
+        assert_eq!(steps(&[wanted("a", "1", true, 1)], &stopped), [start]);
     }
 
     #[test]

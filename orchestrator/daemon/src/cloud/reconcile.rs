@@ -113,9 +113,11 @@ impl Reconciler {
         };
         // A step of an earlier state, which was given up, may still end in its thread: what it
         // changes counts for the plan.
-        let ended = self.step.lock().await;
+        let name = authority.to_owned();
+        if let Err(failure) = self.blocking(move |core| core.leave_other_cloud(&name)).await {
+            return vec![problem(String::new(), String::new(), failure)];
+        }
         let deployed = self.core.lock().state.deployments.clone();
-        drop(ended);
         let (mut steps, mut problems) = plan(&desired.deployments, &deployed);
         if desired.keeps || desired.generation < self.core.followed(authority) {
             problems.extend(steps.extract_if(.., |step| step.takes_away()).map(kept));
@@ -170,7 +172,9 @@ impl Reconciler {
                 .await
             }
             Step::Deploy { id, wish, rolls_back } => {
-                self.deploy(&id, &wish, http).await?;
+                // The request for the fallback is followed once that runs, also after a kill.
+                let rollback = if rolls_back { 0 } else { wish.rollback };
+                self.deploy(&id, &CloudWish { rollback, ..wish.clone() }, http).await?;
                 if rolls_back { self.roll_back(id, wish).await } else { Ok(()) }
             }
         }
@@ -179,6 +183,10 @@ impl Reconciler {
     async fn roll_back(&self, id: ItemName, wish: CloudWish) -> Result<(), Failure> {
         self.blocking(move |core| {
             let deployed = core.lock().state.deployments.get(&id).cloned();
+            let before = deployed.as_ref().and_then(|it| it.cloud.as_ref());
+            if before.is_some_and(|before| wish.start > before.start) && !core.runs(&id) {
+                core.set_wanted(id.as_str(), true, CLOUD)?;
+            }
             if !deployed.is_some_and(|it| it.runs_fallback) {
                 core.roll_back(id.as_str(), "rolled back by the cloud")?;
             }

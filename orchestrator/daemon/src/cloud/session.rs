@@ -8,8 +8,8 @@ use std::time::Duration;
 use futures_util::{SinkExt, StreamExt};
 use gleaner_base::{Exit, Failure, excerpt, hex};
 use gleaner_fleet::{
-    Body, Desired, FRAME_MAX, Frame, Hello, PROTOCOL, Ping, Pong, Reported, STATUS_STREAM,
-    STREAM_NAME_MAX, WANTED_MAX, Welcome, compress,
+    Body, Desired, FRAME_MAX, Frame, Hello, PROBLEMS_MAX, PROTOCOL, Ping, Pong, Reported,
+    STATUS_STREAM, STREAM_NAME_MAX, WANTED_MAX, Welcome, compress,
 };
 use gleaner_spool::BootId;
 use tokio::net::TcpStream;
@@ -36,10 +36,6 @@ use crate::api::Api;
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);
 /// Longest time between two reports.
 const REPORT_MAX: Duration = Duration::from_secs(60);
-/// Maximum number of problems in a report, of causes of each, and of characters of each of these.
-const PROBLEMS_MAX: usize = 100;
-const CAUSES_MAX: usize = 8;
-const PROBLEM_MAX: usize = 300;
 /// Number of frames about records that wait for the thread that sends these. It has one batch of
 /// each stream on its way, so that a cloud that follows the rules does not send more.
 const UPLINK_ORDERS: usize = 4096;
@@ -48,7 +44,6 @@ const GENERATION_MAX: u64 = 1 << 60;
 /// Bounds of the interval of signs of life, in s, whatever the cloud asks for.
 const PING_S: std::ops::RangeInclusive<u32> = 5..=300;
 
-/// A connection that is open.
 pub(super) struct CloudSession<'s> {
     pub(super) api: &'s Api,
     pub(super) http: &'s CloudHttp,
@@ -58,7 +53,6 @@ pub(super) struct CloudSession<'s> {
     pub(super) until: std::time::Instant,
 }
 
-/// The end of a connection.
 #[derive(Debug)]
 pub(super) enum SessionEnd {
     /// The cloud asks to connect again after this time, for this reason.
@@ -79,7 +73,7 @@ impl CloudSession<'_> {
         let authority = settings.borrow().as_ref().map(CloudSettings::authority_digest);
         let authority = authority.unwrap_or_default();
         let Welcome { ping_s, cursors, .. } = self.welcome(&mut socket, &authority).await?;
-        self.api.cloud.set_state(LinkState::Connected, None);
+        self.api.cloud.set_state(LinkState::Connected, None, None);
         let (out, mut outgoing) = mpsc::channel(4);
         let (uplink_orders, received_orders) = sync_mpsc::sync_channel(UPLINK_ORDERS);
         let cursors = cursors.into_iter().map(|cursor| (cursor.stream.clone(), cursor));
@@ -211,7 +205,7 @@ impl CloudSession<'_> {
     async fn welcome(&self, socket: &mut Socket, authority: &str) -> Result<Welcome, Failure> {
         let hello = Hello {
             protocol: PROTOCOL,
-            version: env!("CARGO_PKG_VERSION").to_owned(),
+            version: gleaner_base::version().to_owned(),
             key: self.api.key.to_string(),
             followed: self.api.core.followed(authority),
             boot: BootId::current().map(|boot| hex(&boot.0)).unwrap_or_default(),
@@ -251,7 +245,7 @@ impl CloudSession<'_> {
         let status = self.api.status();
         let Handled { generation, problems } = self.handled.borrow_and_update().clone();
         let all = problems.iter().take(PROBLEMS_MAX);
-        let problems: Vec<_> = all.map(|it| it.bounded(CAUSES_MAX, PROBLEM_MAX)).collect();
+        let problems: Vec<_> = all.map(|it| it.bounded()).collect();
         self.api.cloud.lock().generation = generation;
         let deployments = status.deployments.iter().map(|it| {
             (&it.id, &it.envelope, it.is_wanted, it.runs_fallback, it.is_proven, &it.refused)

@@ -4,12 +4,12 @@
 use std::time::{Duration, Instant, SystemTime};
 
 use gleaner_fleet::{
-    Ack, Body, Cursor, Desired, FRAME_MAX, Frame, GoAway, Hello, Ping, Pong, Records, Reported,
-    Tail, WANTED_MAX, Wanted, Welcome, decompress,
+    Ack, Body, Cursor, Desired, Enrolment, FRAME_MAX, Frame, GoAway, Hello, Ping, Pong, Records,
+    Reported, Tail, WANTED_MAX, Wanted, Welcome, decompress,
 };
 use gleaner_lambda::manifest::LambdaKind;
 use gleaner_protocol::supervision::EventKind;
-use gleaner_protocol::vehicle_api::StreamLine;
+use gleaner_protocol::vehicle_api::{Problem, StreamLine};
 use gleaner_spool::{SpoolItem, SpoolReader};
 use gleaner_trust::{
     Deployment, Grants, Labels, Payload, Revision, RevisionFile, RootKeys, ScopedKey, SecretKey,
@@ -162,7 +162,6 @@ fn root(version: u64, expires: u64) -> Vec<u8> {
     seal(&root, &[&key(ROOT)]).unwrap()
 }
 
-/// Returns a release of the lambda with this code.
 fn revision(release: u64, code: &str) -> Revision {
     let file = |(path, content): (&str, &str)| RevisionFile {
         path: path.parse().unwrap(),
@@ -310,6 +309,14 @@ async fn a_wanted_state_that_is_not_accepted_is_refused_and_what_runs_is_left_al
         assert!(problems[0].is_pending && problems[0].title.contains("it stays here"));
         assert_eq!(vehicle.runs(), runs);
     }
+    // Neither does another cloud. Once it wants the same, it can end it.
+    vehicle.api.core.leave_other_cloud("another").unwrap();
+    channel.send(state(50, vec![])).await;
+    assert_eq!(channel.reported(50).await.problems, Vec::new());
+    assert!(vehicle.runs().contains("front"));
+    channel.send(state(51, vec![good.clone()])).await;
+    assert_eq!(channel.reported(51).await.problems, Vec::new());
+    let runs = vehicle.runs();
     // What was accepted before the root expired runs on; nothing new is accepted.
     vehicle.api.core.install_root(&root(2, now() - 1)).unwrap();
     let new = by(|it| it.release = 10, DEPLOYER);
@@ -318,6 +325,29 @@ async fn a_wanted_state_that_is_not_accepted_is_refused_and_what_runs_is_left_al
     assert!(problems[0].in_words().contains("the trust root expired at"), "{problems:?}");
     assert_eq!(vehicle.runs(), runs);
     vehicle.events("the trust root expired at").await;
+    // With the agreement of a user, a restored cloud has a newer state, which is followed.
+    channel.send(state(101, vec![])).await;
+    assert_eq!(channel.reported(101).await.problems, Vec::new());
+    assert!(!vehicle.runs().contains("front"));
+}
+
+#[tokio::test]
+async fn the_causes_and_the_help_of_a_refused_enrolment_are_kept() {
+    let vehicle = LinkedVehicle::new().await;
+    let help = "an enrolment works once, for 24 hours: make another one with `gleaner vehicles`";
+    let mut refusal = Failure::new(Exit::Denied, "the enrolment is not valid").with_help(help);
+    refusal.causes = vec!["it was used\u{1b}[2J".to_owned(), "x".repeat(10_000)];
+    let body = serde_json::to_vec(&Problem::new(refusal, 403)).unwrap();
+    let head = format!("403 Forbidden\r\ncontent-length: {}", body.len());
+    vehicle.answers.lock().unwrap().insert("/v1/enrol".to_owned(), (head, body));
+    let CloudSettings { address, authority, .. } = vehicle.settings.borrow().clone().unwrap();
+    let (name, token) = ("car".to_owned(), "secret".to_owned());
+    let enrolment = Enrolment { gleaner_enrolment: 1, address, vehicle: name, authority, token };
+    let text = serde_json::to_vec(&enrolment).unwrap();
+    let Api { core, name, cloud, .. } = &vehicle.api;
+    let failure = soon(cloud.enrol(core, name, &text)).await.unwrap_err();
+    assert_eq!(failure.causes[..2], ["the enrolment is not valid", r"it was used\u{1b}[2J"]);
+    assert_eq!((failure.help.as_deref(), failure.causes[2].len()), (Some(help), 300));
 }
 
 #[tokio::test]

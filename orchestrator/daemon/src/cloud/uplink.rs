@@ -7,6 +7,7 @@
 
 use std::collections::BTreeMap;
 use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::{Duration, Instant};
@@ -61,8 +62,8 @@ struct SentStream<S: SpoolStorage = SpoolFolder> {
     waits: Option<Batch>,
     /// The number after those that are on their way, and their count.
     on_its_way: Option<(u64, u64)>,
-    /// True after a look at which it could not be read or made durable.
-    is_failing: bool,
+    /// The reason why it could not be read or made durable at the last look.
+    failure: Option<String>,
 }
 
 struct Batch {
@@ -116,20 +117,38 @@ impl Uplink {
                 }
                 Err(RecvTimeoutError::Disconnected) => return,
             }
-            self.cloud.lock().unsent = streams.values().map(SentStream::unsent).sum();
+            let failing =
+                streams.iter().filter_map(|(name, it)| Some((name, it.failure.as_ref()?)));
+            let unopened = unreadable.iter().map(|(name, (_, error))| (name, error));
+            let unsent: u64 = streams.values().map(SentStream::unsent).sum();
+            self.cloud.set_unsent(unsent, failing.chain(unopened));
         }
     }
 
-    /// Opens streams that did not exist before.
-    /// `unreadable` has those that could not be opened, with the times of the next tries.
+    /// Opens streams that did not exist before. `unreadable` has those that could not be opened,
+    /// with the times of the next tries and the errors.
     fn find_new(
         &self,
         streams: &mut BTreeMap<String, SentStream>,
-        unreadable: &mut BTreeMap<String, Instant>,
+        unreadable: &mut BTreeMap<String, (Instant, String)>,
     ) {
-        for name in names(&self.spool) {
-            let is_late = |until: &Instant| *until > Instant::now();
-            if streams.contains_key(&name) || unreadable.get(&name).is_some_and(is_late) {
+        let own = STREAMS.iter().map(|name| (*name).to_owned());
+        let mut found: Vec<_> = own.filter(|name| self.spool.join(name).is_dir()).collect();
+        match lambda_streams(&self.spool) {
+            Ok(names) => {
+                found.extend(names);
+                // The files of one that was removed are open, and its failure would stay.
+                streams.retain(|name, stream| stream.failure.is_none() || found.contains(name));
+                // The others are due, or were removed.
+                let is_late = |until: &Instant| *until > Instant::now();
+                unreadable.retain(|name, (until, _)| is_late(until) && found.contains(name));
+            }
+            Err(error) => {
+                unreadable.insert("lambdas".to_owned(), (Instant::now(), error.to_string()));
+            }
+        }
+        for name in found {
+            if streams.contains_key(&name) || unreadable.contains_key(&name) {
                 continue;
             }
             let folder = self.spool.join(&name);
@@ -140,7 +159,7 @@ impl Uplink {
                     // Each look would read all of it.
                     let error = chain(&error);
                     tracing::warn!(stream = name, error, "cannot go on with a stream; will retry");
-                    unreadable.insert(name, Instant::now() + UNREADABLE);
+                    unreadable.insert(name, (Instant::now() + UNREADABLE, error));
                     continue;
                 }
             };
@@ -187,7 +206,7 @@ impl<S: SpoolStorage> SentStream<S> {
             is_behind: true,
             waits: None,
             on_its_way: None,
-            is_failing: false,
+            failure: None,
         }
     }
 
@@ -199,20 +218,22 @@ impl<S: SpoolStorage> SentStream<S> {
 
     /// Reads the next records; returns those that are due, once they are durable.
     fn batch(&mut self, name: &str, is_read: bool, now: Instant) -> Option<Batch> {
-        let is_at_end = self.collect(last_part(name), now);
+        let read = self.collect(last_part(name), now);
         // Lines that were read before a failure do not wait until it ends.
-        let is_due = self.is_behind || is_read || self.is_failing || self.collected.is_due(now);
-        self.is_behind &= !is_at_end;
-        if !is_due || self.collected.count() == 0 {
-            return None;
-        }
-        if let Err(error) = self.reader.sync() {
-            self.note(name, &error);
+        let has_failed = read.is_err() || self.failure.is_some();
+        let is_due = self.is_behind || is_read || has_failed || self.collected.is_due(now);
+        self.is_behind &= matches!(read, Ok(false));
+        let is_sent = is_due && self.collected.count() > 0;
+        let synced = if is_sent { self.reader.sync() } else { Ok(()) };
+        if synced.is_err() {
             self.reader.rewind(self.batched);
             self.collected = CollectedLines::default();
+        }
+        let is_durable = is_sent && synced.is_ok();
+        self.note(name, synced.err().or(read.err()));
+        if !is_durable {
             return None;
         }
-        self.is_failing = false;
         self.batched = self.reader.position();
         let next = self.batched?;
         let (lines, count) = self.collected.take()?;
@@ -220,18 +241,14 @@ impl<S: SpoolStorage> SentStream<S> {
     }
 
     /// Reads records up to a whole batch; returns whether there are no more for now.
-    fn collect(&mut self, name: &str, now: Instant) -> bool {
+    fn collect(&mut self, name: &str, now: Instant) -> Result<bool, SpoolError> {
         while self.collected.bytes() < BATCH && self.collected.count() < RECORDS_MAX as u64 {
             let item = match self.reader.next() {
                 // A commit in progress, or one that a power cut interrupted: a gap follows.
-                None | Some(Ok(SpoolItem::Torn(_))) => return true,
-                Some(item) => item,
+                None | Some(Ok(SpoolItem::Torn(_))) => return Ok(true),
+                Some(item) => item?,
             };
-            if let Err(error) = &item {
-                self.note(name, error);
-                return true;
-            }
-            let mut line = line(name, item);
+            let mut line = line(name, Ok(item));
             let mut encoded = serde_json::to_vec(&line).expect("a line is plain data");
             if encoded.len() > FRAME_MAX / 2 {
                 let text = format!("a record of {} bytes is too long to be sent", encoded.len());
@@ -240,15 +257,16 @@ impl<S: SpoolStorage> SentStream<S> {
             }
             self.collected.add(&line, &encoded, now);
         }
-        false
+        Ok(false)
     }
 
-    /// Logs a failure, unless the look before it has failed, too.
-    fn note(&mut self, name: &str, error: &SpoolError) {
-        if !self.is_failing {
-            tracing::warn!(stream = name, error = chain(error), "cannot send a stream; will retry");
+    /// Keeps the outcome of a look. A failure is logged, unless the look before has failed, too.
+    fn note(&mut self, name: &str, failure: Option<SpoolError>) {
+        let failure = failure.map(|error| chain(&error));
+        if let (None, Some(error)) = (&self.failure, &failure) {
+            tracing::warn!(stream = name, error, "cannot send a stream; will retry");
         }
-        self.is_failing = true;
+        self.failure = failure;
     }
 }
 
@@ -257,13 +275,14 @@ fn last_part(name: &str) -> &str {
     name.rsplit('/').next().unwrap_or(name)
 }
 
-/// Returns the names of all streams in the folder of the spools.
-fn names(spool: &Path) -> Vec<String> {
-    let own = STREAMS.iter().map(|name| (*name).to_owned());
-    let own = own.filter(|name| spool.join(name).is_dir());
-    let lambdas = fs::read_dir(spool.join("lambdas")).into_iter().flatten().flatten();
-    let lambdas = lambdas.filter_map(|entry| entry.file_name().into_string().ok());
-    own.chain(lambdas.map(|id| format!("lambdas/{id}"))).collect()
+/// Returns the names of the streams of lambdas in the folder of the spools.
+fn lambda_streams(spool: &Path) -> io::Result<Vec<String>> {
+    let entries = match fs::read_dir(spool.join("lambdas")) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
+        entries => entries?,
+    };
+    let ids = entries.flatten().filter_map(|entry| entry.file_name().into_string().ok());
+    Ok(ids.map(|id| format!("lambdas/{id}")).collect())
 }
 
 #[cfg(test)]

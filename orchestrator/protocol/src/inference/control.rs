@@ -9,9 +9,9 @@ use serde::{Deserialize, Serialize};
 
 use super::INFERENCE;
 use crate::link::frame::{self, tag};
-use crate::link::{FrameReceiver, Incoming, LinkError, ReceivedFrame, send_frame};
-
-const STARTER: &str = "the starter";
+use crate::link::{
+    FrameReceiver, Incoming, LinkError, ReceivedFrame, STARTER, send_frame, send_json,
+};
 
 /// Time to wait while the process does not read.
 const TIMEOUT: Duration = Duration::from_secs(10);
@@ -114,7 +114,7 @@ impl InferenceControl {
         engine: Option<BorrowedFd<'_>>,
     ) -> Result<(), LinkError> {
         let descriptors: Vec<_> = [file].into_iter().chain(engine).collect();
-        self.send(tag::MODEL_FILE, model, &descriptors)
+        send_json(&self.socket, tag::MODEL_FILE, model, &descriptors, INFERENCE)
     }
 
     /// Adds a lambda, whose process has the other end of `socket`.
@@ -123,7 +123,7 @@ impl InferenceControl {
     ///
     /// Those of [`add_model`](Self::add_model).
     pub fn add_client(&self, client: &AddClient, socket: BorrowedFd<'_>) -> Result<(), LinkError> {
-        self.send(tag::ADD_CLIENT, client, &[socket])
+        send_json(&self.socket, tag::ADD_CLIENT, client, &[socket], INFERENCE)
     }
 
     /// Requests the process to exit.
@@ -133,17 +133,6 @@ impl InferenceControl {
     /// [`LinkError::Gone`] if it has ended.
     pub fn stop(&self) -> Result<(), LinkError> {
         send_frame(&self.socket, &frame::encode(tag::STOP, &[]), &[], INFERENCE)
-    }
-
-    fn send(
-        &self,
-        tag: u8,
-        message: &impl Serialize,
-        descriptors: &[BorrowedFd<'_>],
-    ) -> Result<(), LinkError> {
-        let failed = |source| LinkError::Socket { peer: INFERENCE, source };
-        let payload = serde_json::to_vec(message).map_err(|error| failed(error.into()))?;
-        send_frame(&self.socket, &frame::encode(tag, &payload), descriptors, INFERENCE)
     }
 }
 
@@ -169,11 +158,7 @@ impl InferenceServer {
     ///
     /// [`LinkError`] names the invalid frame; nothing can be read after it.
     pub fn poll(&mut self) -> Result<Incoming<InferenceRequest>, LinkError> {
-        Ok(match self.frames.poll(&self.socket)? {
-            Incoming::Message(frame) => Incoming::Message(request(frame)?),
-            Incoming::Nothing => Incoming::Nothing,
-            Incoming::Ended => Incoming::Ended,
-        })
+        self.frames.poll(&self.socket, request)
     }
 }
 

@@ -57,18 +57,15 @@ impl IngressLink {
     ///
     /// [`LinkError`] names the invalid frame; nothing can be read after it.
     pub fn poll(&mut self) -> Result<Incoming<ReaderDelivery>, LinkError> {
-        let mut frame = match self.frames.poll(&self.socket)? {
-            Incoming::Message(frame) => frame,
-            Incoming::Nothing => return Ok(Incoming::Nothing),
-            Incoming::Ended => return Ok(Incoming::Ended),
-        };
-        if frame.tag != tag::READER {
-            return Err(LinkError::Unknown { peer: INGRESS, tag: frame.tag });
-        }
-        let message = frame.json(INGRESS)?;
-        let needs = matches!(message, ReaderMessage::Welcome | ReaderMessage::Attached(_));
-        let descriptor = if needs { Some(frame.descriptor()?) } else { None };
-        Ok(Incoming::Message(ReaderDelivery { message, descriptor }))
+        self.frames.poll(&self.socket, |mut frame| {
+            if frame.tag != tag::READER {
+                return Err(LinkError::Unknown { peer: INGRESS, tag: frame.tag });
+            }
+            let message = frame.json(INGRESS)?;
+            let needs = matches!(message, ReaderMessage::Welcome | ReaderMessage::Attached(_));
+            let descriptor = if needs { Some(frame.descriptor()?) } else { None };
+            Ok(ReaderDelivery { message, descriptor })
+        })
     }
 }
 

@@ -6,13 +6,13 @@ use std::os::unix::net::UnixStream;
 use std::time::Duration;
 
 use gleaner_base::visible;
-use serde::Serialize;
 
 use super::{AddReader, AddTopics};
 use crate::link::frame::{self, tag};
-use crate::link::{FRAME_MAX, FrameReceiver, Incoming, LinkError, ReceivedFrame, send_frame};
+use crate::link::{
+    FrameReceiver, Incoming, LinkError, ReceivedFrame, STARTER, send_frame, send_json,
+};
 
-const STARTER: &str = "the starter";
 const INGRESS: &str = "the ingress";
 
 /// Maximum time that a request waits while the ingress does not read; it reads within seconds even
@@ -48,7 +48,7 @@ impl IngressControl {
         add.check().map_err(|source| LinkError::Grant { source })?;
         let failed = |source| LinkError::Socket { peer: INGRESS, source };
         let (reader_end, ingress_end) = UnixStream::pair().map_err(failed)?;
-        self.send(tag::ADD_READER, add, &[ingress_end.as_fd()])?;
+        send_json(&self.socket, tag::ADD_READER, add, &[ingress_end.as_fd()], INGRESS)?;
         Ok(reader_end.into())
     }
 
@@ -59,7 +59,7 @@ impl IngressControl {
     /// Those of [`add_reader`](Self::add_reader).
     pub fn add_topics(&mut self, add: &AddTopics) -> Result<(), LinkError> {
         add.check().map_err(|source| LinkError::Grant { source })?;
-        self.send(tag::ADD_TOPICS, add, &[])
+        send_json(&self.socket, tag::ADD_TOPICS, add, &[], INGRESS)
     }
 
     /// Requests the ingress to play its drive. Send it once all readers are ready.
@@ -78,21 +78,6 @@ impl IngressControl {
     /// [`LinkError::Gone`] if it has ended.
     pub fn stop(&mut self) -> Result<(), LinkError> {
         send_frame(&self.socket, &frame::encode(tag::STOP, &[]), &[], INGRESS)
-    }
-
-    fn send(
-        &self,
-        tag: u8,
-        message: &impl Serialize,
-        sockets: &[BorrowedFd<'_>],
-    ) -> Result<(), LinkError> {
-        let failed = |source| LinkError::Socket { peer: INGRESS, source };
-        let payload = serde_json::to_vec(message).map_err(|error| failed(error.into()))?;
-        if payload.len() > FRAME_MAX {
-            let (frame, bytes) = (frame::name(tag), payload.len() as u64);
-            return Err(LinkError::TooLong { peer: STARTER, frame, bytes, max: FRAME_MAX });
-        }
-        send_frame(&self.socket, &frame::encode(tag, &payload), sockets, INGRESS)
     }
 }
 
@@ -141,11 +126,7 @@ impl IngressServer {
     ///
     /// Those of [`receive`](Self::receive).
     pub fn poll(&mut self) -> Result<Incoming<IngressRequest>, LinkError> {
-        Ok(match self.frames.poll(&self.socket)? {
-            Incoming::Message(frame) => Incoming::Message(request(frame)?),
-            Incoming::Nothing => Incoming::Nothing,
-            Incoming::Ended => Incoming::Ended,
-        })
+        self.frames.poll(&self.socket, request)
     }
 }
 

@@ -163,7 +163,6 @@ impl ReaderLink {
         std::mem::take(&mut self.uncounted)
     }
 
-    /// Returns the next received request.
     fn next_request(&mut self) -> Result<Option<ReaderRequest>, LinkError> {
         let rest = &self.received[self.parsed..];
         let Some((head, rest)) = rest.split_first_chunk::<HEAD>() else { return Ok(None) };

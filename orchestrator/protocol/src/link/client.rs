@@ -380,15 +380,5 @@ impl RecorderLink {
 }
 
 fn encode_hello(header: &JournalHeader) -> Result<Vec<u8>, LinkError> {
-    let failed = |source: io::Error| LinkError::Socket { peer: RECORDER, source };
-    let payload = serde_json::to_vec(header).map_err(|error| failed(error.into()))?;
-    if payload.len() > super::FRAME_MAX {
-        return Err(LinkError::TooLong {
-            peer: "the lambda",
-            frame: "hello",
-            bytes: payload.len() as u64,
-            max: super::FRAME_MAX,
-        });
-    }
-    Ok(frame::encode(tag::HELLO, &payload))
+    frame::encode_json(tag::HELLO, header, "the lambda", RECORDER)
 }

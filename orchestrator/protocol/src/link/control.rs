@@ -8,10 +8,9 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use super::frame::{self, tag};
-use super::{FrameReceiver, LinkError, outgoing};
+use super::{FrameReceiver, LinkError, STARTER, send_frame, send_json};
 use gleaner_lambda::manifest::Limits;
 
-const STARTER: &str = "the starter";
 const RECORDER: &str = "the recorder";
 
 /// Adds a lambda to the recorder.
@@ -57,17 +56,7 @@ impl ControlClient {
     pub fn add(&mut self, add: &AddLambda) -> Result<OwnedFd, LinkError> {
         let failed = |source| LinkError::Socket { peer: RECORDER, source };
         let (lambda_end, recorder_end) = UnixStream::pair().map_err(failed)?;
-        let payload = serde_json::to_vec(add).map_err(|error| failed(error.into()))?;
-        let bytes = frame::encode(tag::ADD, &payload);
-        if payload.len() > super::FRAME_MAX {
-            return Err(LinkError::TooLong {
-                peer: STARTER,
-                frame: "add",
-                bytes: payload.len() as u64,
-                max: super::FRAME_MAX,
-            });
-        }
-        outgoing::send_frame(&self.socket, &bytes, &[recorder_end.as_fd()], RECORDER)?;
+        send_json(&self.socket, tag::ADD, add, &[recorder_end.as_fd()], RECORDER)?;
         Ok(lambda_end.into())
     }
 
@@ -77,7 +66,7 @@ impl ControlClient {
     ///
     /// [`LinkError::Gone`] if it has ended.
     pub fn stop(&mut self) -> Result<(), LinkError> {
-        outgoing::send_frame(&self.socket, &frame::encode(tag::STOP, &[]), &[], RECORDER)
+        send_frame(&self.socket, &frame::encode(tag::STOP, &[]), &[], RECORDER)
     }
 
     /// As [`stop`](Self::stop), while the lambdas run on: they join another recorder.
@@ -86,7 +75,7 @@ impl ControlClient {
     ///
     /// [`LinkError::Gone`] if it has ended.
     pub fn give_way(&mut self) -> Result<(), LinkError> {
-        outgoing::send_frame(&self.socket, &frame::encode(tag::GIVE_WAY, &[]), &[], RECORDER)
+        send_frame(&self.socket, &frame::encode(tag::GIVE_WAY, &[]), &[], RECORDER)
     }
 }
 

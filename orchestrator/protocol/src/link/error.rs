@@ -8,126 +8,48 @@ use crate::ingress::GrantError;
 use gleaner_base::{Exit, Explain};
 use gleaner_journal::MalformedWake;
 
-/// An error of a connection between two programs.
+/// An error of a connection between two programs. `peer` is the other end, or the sender of a
+/// frame, by its name in messages, such as "the recorder".
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs)]
 pub enum LinkError {
-    /// The other side has ended, or closed the connection.
     #[error("{peer} has ended, or closed the connection")]
-    Gone {
-        /// Its name in messages, such as "the recorder".
-        peer: &'static str,
-    },
-    /// The recorder refuses the lambda.
+    Gone { peer: &'static str },
     #[error("the recorder refuses the lambda: {reason}")]
-    Refused {
-        /// The reason, from the recorder.
-        reason: String,
-    },
-    /// The recorder does not respond.
+    Refused { reason: String },
     #[error("the recorder has not responded for {seconds} s")]
-    Silent {
-        /// The timeout.
-        seconds: u64,
-    },
-    /// A frame is too long.
+    Silent { seconds: u64 },
+    /// A frame is too long: `bytes` is the length in its head.
     #[error("frame `{frame}` from {peer} has {bytes} bytes, above the maximum of {max}")]
-    TooLong {
-        /// Sender of the frame.
-        peer: &'static str,
-        /// Name of the frame.
-        frame: &'static str,
-        /// The length in its head.
-        bytes: u64,
-        /// The maximum.
-        max: usize,
-    },
+    TooLong { peer: &'static str, frame: &'static str, bytes: u64, max: usize },
     /// A frame has an unknown tag, or one for another connection.
     #[error("frame {tag} from {peer} is unknown")]
-    Unknown {
-        /// Sender of the frame.
-        peer: &'static str,
-        /// Tag of the frame.
-        tag: u8,
-    },
-    /// A frame is out of order.
+    Unknown { peer: &'static str, tag: u8 },
     #[error("received frame `{frame}` from {peer} instead of `{expected}`")]
-    Unexpected {
-        /// Sender of the frame.
-        peer: &'static str,
-        /// Name of the frame.
-        frame: &'static str,
-        /// The expected frame.
-        expected: &'static str,
-    },
-    /// The payload of a frame is invalid.
+    Unexpected { peer: &'static str, frame: &'static str, expected: &'static str },
     #[error("frame `{frame}` from {peer} is invalid: {reason}")]
-    Malformed {
-        /// Sender of the frame.
-        peer: &'static str,
-        /// Name of the frame.
-        frame: &'static str,
-        /// The reason.
-        reason: String,
-    },
-    /// The wake in a frame cannot be decoded.
+    Malformed { peer: &'static str, frame: &'static str, reason: String },
     #[error("frame `wake` from {peer} cannot be decoded")]
-    Wake {
-        /// Sender of the frame.
-        peer: &'static str,
-        /// The cause.
-        source: MalformedWake,
-    },
-    /// A frame lacks the descriptor that belongs to it.
+    Wake { peer: &'static str, source: MalformedWake },
     #[error("frame `{frame}` came without its descriptor")]
-    NoDescriptor {
-        /// Name of the frame.
-        frame: &'static str,
-    },
+    NoDescriptor { frame: &'static str },
     /// The socket of a reader did not arrive: the ingress has too many open files.
     #[error("cannot serve reader `{reader}`: its socket did not arrive")]
-    NoSocket {
-        /// Name of the reader.
-        reader: String,
-    },
-    /// The starter did not pass a connection that the program needs.
+    NoSocket { reader: String },
     #[error("the starter passed no connection `{name}`")]
-    NoConnection {
-        /// Its name.
-        name: &'static str,
-    },
-    /// The standard input of a program is no connection to a starter.
+    NoConnection { name: &'static str },
     #[error("the standard input is no socket of a program that starts this one")]
     NoStarter,
     /// The other side is of another version, and may share memory of another layout.
     #[error("{peer} is of version `{version}` of Gleaner, this program of {own}")]
-    OtherVersion {
-        /// Its name in messages.
-        peer: &'static str,
-        /// Its version.
-        version: String,
-        /// The version of this program.
-        own: &'static str,
-    },
-    /// A grant to a reader is invalid.
+    OtherVersion { peer: &'static str, version: String, own: &'static str },
     #[error("cannot grant topics to a reader")]
-    Grant {
-        /// The cause.
-        source: GrantError,
-    },
+    Grant { source: GrantError },
     /// The other side does not read, and the queue of messages to it is full.
     #[error("{peer} does not read its messages")]
-    Full {
-        /// Its name in messages.
-        peer: &'static str,
-    },
-    /// The socket failed.
+    Full { peer: &'static str },
     #[error("the connection to {peer} failed")]
-    Socket {
-        /// The other end.
-        peer: &'static str,
-        /// The error of the system.
-        source: io::Error,
-    },
+    Socket { peer: &'static str, source: io::Error },
 }
 
 impl LinkError {

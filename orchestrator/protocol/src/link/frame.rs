@@ -2,6 +2,8 @@
 
 use std::io::{self, Read};
 
+use serde::Serialize;
+
 use super::LinkError;
 
 /// Longest payload, that of the longest block of a journal: the header of a build with thousands of
@@ -11,76 +13,66 @@ pub const FRAME_MAX: usize = 2 << 20;
 /// Length of the head, before the payload.
 pub(crate) const HEAD: usize = 5;
 
-/// Tags of frames.
-pub(crate) mod tag {
-    /// Starter to recorder: a lambda, as JSON, with its socket.
-    pub(crate) const ADD: u8 = 1;
-    /// Starter to recorder: complete open clips and exit. Starter to others: exit.
-    pub(crate) const STOP: u8 = 2;
-    /// Starter to ingress: a reader, as JSON, with its socket.
-    pub(crate) const ADD_READER: u8 = 3;
-    /// Starter to ingress: further topics for a reader, as JSON.
-    pub(crate) const ADD_TOPICS: u8 = 4;
-    /// Starter to ingress: play the drive.
-    pub(crate) const BEGIN: u8 = 5;
-    /// Starter to a program that it starts: names of connections as JSON, with their sockets.
-    pub(crate) const HANDOVER: u8 = 6;
-    /// Starter to gleaner-inference: a model, as JSON, with its file.
-    pub(crate) const MODEL_FILE: u8 = 7;
-    /// Starter to gleaner-inference: a lambda, as JSON, with its socket.
-    pub(crate) const ADD_CLIENT: u8 = 8;
-    /// Starter to recorder: as `STOP`, while the lambdas run on, with another recorder.
-    pub(crate) const GIVE_WAY: u8 = 9;
-    /// Lambda to recorder: the header of its journal, as JSON. Sent once, first.
-    pub(crate) const HELLO: u8 = 16;
-    /// Lambda to recorder: `i64` time of the decision, `u32` number of missing wakes before it, and
-    /// the wake as in a journal.
-    pub(crate) const WAKE: u8 = 17;
-    /// Lambda to recorder: the end of the connection.
-    pub(crate) const BYE: u8 = 18;
-    /// Lambda to recorder: the engine, as text, in place of that in the header.
-    pub(crate) const ENGINE: u8 = 19;
-    /// Recorder to lambda: it is accepted.
-    pub(crate) const READY: u8 = 32;
-    /// Recorder to lambda: it is refused; the reason as text.
-    pub(crate) const REFUSED: u8 = 33;
-    /// Recorder to lambda: `u64` ns from a decision with triggers to the opening of its windows.
-    pub(crate) const OPENED: u8 = 34;
-    /// Ingress to reader: a message as JSON; some with a descriptor.
-    pub(crate) const READER: u8 = 48;
-    /// Reader to ingress: `u32` id of the topic whose definitions it needs.
-    pub(crate) const DEFINITIONS: u8 = 64;
-    /// Reader to ingress: `u32` index of the topic to publish, and a message.
-    pub(crate) const PUBLISH: u8 = 65;
-    /// Reader to ingress: `u32` id of the topic whose layout it needs.
-    pub(crate) const LAYOUT: u8 = 66;
+/// Defines the tags of frames, and their names for messages.
+macro_rules! tags {
+    ($($(#[$doc:meta])+ $tag:ident = $number:literal, $name:literal;)+) => {
+        /// Tags of frames.
+        pub(crate) mod tag {
+            $($(#[$doc])+ pub(crate) const $tag: u8 = $number;)+
+        }
+
+        /// Returns the name of a tag for messages.
+        pub(crate) fn name(tag: u8) -> &'static str {
+            match tag {
+                $(tag::$tag => $name,)+
+                _ => "unknown",
+            }
+        }
+    };
 }
 
-/// Returns the name of a tag for messages.
-pub(crate) fn name(tag: u8) -> &'static str {
-    match tag {
-        tag::ADD => "add",
-        tag::STOP => "stop",
-        tag::GIVE_WAY => "give way",
-        tag::HELLO => "hello",
-        tag::WAKE => "wake",
-        tag::BYE => "bye",
-        tag::ENGINE => "engine",
-        tag::READY => "ready",
-        tag::REFUSED => "refused",
-        tag::OPENED => "opened",
-        tag::ADD_READER => "add reader",
-        tag::ADD_TOPICS => "add topics",
-        tag::BEGIN => "begin",
-        tag::HANDOVER => "handover",
-        tag::MODEL_FILE => "model file",
-        tag::ADD_CLIENT => "add client",
-        tag::READER => "message",
-        tag::DEFINITIONS => "definitions",
-        tag::PUBLISH => "publish",
-        tag::LAYOUT => "layout",
-        _ => "unknown",
-    }
+tags! {
+    /// Starter to recorder: a lambda, as JSON, with its socket.
+    ADD = 1, "add";
+    /// Starter to recorder: complete open clips and exit. Starter to others: exit.
+    STOP = 2, "stop";
+    /// Starter to ingress: a reader, as JSON, with its socket.
+    ADD_READER = 3, "add reader";
+    /// Starter to ingress: further topics for a reader, as JSON.
+    ADD_TOPICS = 4, "add topics";
+    /// Starter to ingress: play the drive.
+    BEGIN = 5, "begin";
+    /// Starter to a program that it starts: names of connections as JSON, with their sockets.
+    HANDOVER = 6, "handover";
+    /// Starter to gleaner-inference: a model, as JSON, with its file.
+    MODEL_FILE = 7, "model file";
+    /// Starter to gleaner-inference: a lambda, as JSON, with its socket.
+    ADD_CLIENT = 8, "add client";
+    /// Starter to recorder: as `STOP`, while the lambdas run on, with another recorder.
+    GIVE_WAY = 9, "give way";
+    /// Lambda to recorder: the header of its journal, as JSON. Sent once, first.
+    HELLO = 16, "hello";
+    /// Lambda to recorder: `i64` time of the decision, `u32` number of missing wakes before it, and
+    /// the wake as in a journal.
+    WAKE = 17, "wake";
+    /// Lambda to recorder: the end of the connection.
+    BYE = 18, "bye";
+    /// Lambda to recorder: the engine, as text, in place of that in the header.
+    ENGINE = 19, "engine";
+    /// Recorder to lambda: it is accepted.
+    READY = 32, "ready";
+    /// Recorder to lambda: it is refused; the reason as text.
+    REFUSED = 33, "refused";
+    /// Recorder to lambda: `u64` ns from a decision with triggers to the opening of its windows.
+    OPENED = 34, "opened";
+    /// Ingress to reader: a message as JSON; some with a descriptor.
+    READER = 48, "message";
+    /// Reader to ingress: `u32` id of the topic whose definitions it needs.
+    DEFINITIONS = 64, "definitions";
+    /// Reader to ingress: `u32` index of the topic to publish, and a message.
+    PUBLISH = 65, "publish";
+    /// Reader to ingress: `u32` id of the topic whose layout it needs.
+    LAYOUT = 66, "layout";
 }
 
 /// Begins a frame in `out`; [`close`] completes it.
@@ -99,13 +91,28 @@ pub(crate) fn close(out: &mut [u8]) -> bool {
     false
 }
 
-/// Returns a complete frame.
 pub(crate) fn encode(tag: u8, payload: &[u8]) -> Vec<u8> {
     let mut out = Vec::with_capacity(HEAD + payload.len());
     open(tag, &mut out);
     out.extend_from_slice(payload);
     close(&mut out);
     out
+}
+
+/// Returns a complete frame with a message of `from` as JSON, unless that is too long.
+pub(crate) fn encode_json(
+    tag: u8,
+    message: &impl Serialize,
+    from: &'static str,
+    to: &'static str,
+) -> Result<Vec<u8>, LinkError> {
+    let payload = serde_json::to_vec(message)
+        .map_err(|error| LinkError::Socket { peer: to, source: error.into() })?;
+    if payload.len() > FRAME_MAX {
+        let (frame, bytes) = (name(tag), payload.len() as u64);
+        return Err(LinkError::TooLong { peer: from, frame, bytes, max: FRAME_MAX });
+    }
+    Ok(encode(tag, &payload))
 }
 
 /// Parses a head: tag and length.

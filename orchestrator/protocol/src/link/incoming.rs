@@ -12,7 +12,7 @@ use super::LinkError;
 use super::frame::{self, HEAD};
 
 /// Largest number of descriptors with a frame of any connection.
-const DESCRIPTORS: usize = 4;
+pub(super) const DESCRIPTORS: usize = 4;
 
 /// Number of bytes that are read at a time: memory grows as bytes arrive, not by the length in the
 /// head.
@@ -42,7 +42,6 @@ pub(crate) struct FrameReceiver {
     descriptors: Vec<OwnedFd>,
 }
 
-/// A complete frame.
 #[derive(Debug)]
 pub(crate) struct ReceivedFrame {
     pub(crate) tag: u8,
@@ -68,9 +67,17 @@ impl FrameReceiver {
         }
     }
 
-    /// Returns the next frame, if it is complete.
-    pub(crate) fn poll(&mut self, socket: impl AsFd) -> Result<Incoming<ReceivedFrame>, LinkError> {
-        self.receive(&socket, RecvFlags::DONTWAIT)
+    /// Returns the next frame as a message, if it is complete.
+    pub(crate) fn poll<T>(
+        &mut self,
+        socket: impl AsFd,
+        message: impl FnOnce(ReceivedFrame) -> Result<T, LinkError>,
+    ) -> Result<Incoming<T>, LinkError> {
+        Ok(match self.receive(&socket, RecvFlags::DONTWAIT)? {
+            Incoming::Message(frame) => Incoming::Message(message(frame)?),
+            Incoming::Nothing => Incoming::Nothing,
+            Incoming::Ended => Incoming::Ended,
+        })
     }
 
     /// Reads until a frame is complete, or until the call would wait.
@@ -125,7 +132,6 @@ impl FrameReceiver {
 }
 
 impl ReceivedFrame {
-    /// Parses the payload as JSON.
     pub(crate) fn json<T: DeserializeOwned>(&self, peer: &'static str) -> Result<T, LinkError> {
         serde_json::from_slice(&self.payload).map_err(|error| LinkError::Malformed {
             peer,

@@ -35,6 +35,9 @@ pub use frame::FRAME_MAX;
 pub use grants::{COMMANDS_ID, commands_grant, recorded_grant};
 pub use incoming::Incoming;
 pub(crate) use incoming::{FrameReceiver, ReceivedFrame};
-pub(crate) use outgoing::{FrameQueue, send_frame, try_send_frame};
+pub(crate) use outgoing::{FrameQueue, send_frame, send_json, try_send_frame};
 pub use report::{CommandStatus, Loss, RecordedTopic, RecorderReport, RecorderStatus};
 pub use server::{LambdaLink, LambdaMessage, LambdaReplies};
+
+/// The program that starts the others, in messages.
+pub(crate) const STARTER: &str = "the starter";

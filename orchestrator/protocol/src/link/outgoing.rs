@@ -7,11 +7,10 @@ use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 
 use rustix::io::Errno;
 use rustix::net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, send, sendmsg};
+use serde::Serialize;
 
-use super::LinkError;
-
-/// Largest number of descriptors with a frame of any connection.
-const DESCRIPTORS: usize = 4;
+use super::incoming::DESCRIPTORS;
+use super::{LinkError, STARTER, frame};
 
 /// Sends a frame and its descriptors, and waits until the other side has room for all of it. A peer
 /// that has ended is an error, not a signal. If the socket has a timeout, the wait is as long.
@@ -33,6 +32,17 @@ pub(crate) fn send_frame(
         }
     }
     Ok(())
+}
+
+/// Sends a message of the starter as JSON, as [`send_frame`] does, unless it is too long.
+pub(crate) fn send_json(
+    socket: &impl AsFd,
+    tag: u8,
+    message: &impl Serialize,
+    descriptors: &[BorrowedFd<'_>],
+    peer: &'static str,
+) -> Result<(), LinkError> {
+    send_frame(socket, &frame::encode_json(tag, message, STARTER, peer)?, descriptors, peer)
 }
 
 /// Sends a frame and its descriptors as a whole, if the other side has room for it. Never waits.
@@ -92,7 +102,6 @@ struct OutgoingFrame {
 }
 
 impl FrameQueue {
-    /// Adds a frame.
     pub(crate) fn push(&mut self, bytes: Vec<u8>, descriptor: Option<OwnedFd>) {
         self.bytes += bytes.len();
         self.frames.push_back(OutgoingFrame { bytes, descriptor });
@@ -139,12 +148,10 @@ impl FrameQueue {
         rest
     }
 
-    /// Returns true if all frames are sent.
     pub(crate) fn is_empty(&self) -> bool {
         self.frames.is_empty()
     }
 
-    /// Returns the number of bytes that were sent so far.
     pub(crate) fn total(&self) -> u64 {
         self.total
     }

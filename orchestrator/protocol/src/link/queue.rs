@@ -55,7 +55,6 @@ impl Queue {
         true
     }
 
-    /// Counts a dropped wake.
     pub(super) fn count_dropped(&mut self, triggers: usize) {
         self.missing = self.missing.saturating_add(1);
         self.wakes_dropped += u64::from(triggers == 0);
@@ -81,7 +80,6 @@ impl Queue {
         true
     }
 
-    /// Drops all frames.
     pub(super) fn drop_all(&mut self) {
         for frame in std::mem::take(&mut self.frames) {
             self.count_dropped(frame.triggers);

@@ -140,10 +140,7 @@ impl LambdaReplies {
 
     /// Refuses the lambda for this `reason`, which is cut if it is too long.
     pub fn refused(&mut self, reason: &str) {
-        let end = (0..=REASON_MAX.min(reason.len()))
-            .rev()
-            .find(|end| reason.is_char_boundary(*end))
-            .unwrap_or(0);
+        let end = reason.floor_char_boundary(REASON_MAX);
         self.send(tag::REFUSED, &reason.as_bytes()[..end]);
     }
 

@@ -69,7 +69,7 @@ pub struct DesiredState {
 }
 
 /// A lambda that runs. One that differs from the running one in any field replaces it.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DesiredLambda {
     /// Id of its deployment.

@@ -74,6 +74,28 @@ fn released_segments_are_removed_when_room_is_needed_and_leave_no_gap_record() {
 }
 
 #[test]
+fn numbers_that_were_released_and_are_used_again_are_lost_if_the_budget_removes_them() {
+    for records in [0, 3] {
+        let disk = SimulatedDisk::new(1);
+        for _ in 0..records {
+            let mut writer = writer(&disk);
+            writer.append(KIND, TIME, b"").unwrap();
+            writer.commit().unwrap();
+        }
+        // A disk has lost what came after.
+        disk.release(1 << 40).unwrap();
+        let mut writer = writer(&disk);
+        assert_eq!(disk.released().unwrap(), records);
+        for _ in 0..1000 {
+            writer.append(KIND, TIME, &[7; 100]).unwrap();
+            writer.commit().unwrap();
+        }
+        assert!(writer.status().removed > 0, "{records} records");
+        assert!(gaps(&disk).iter().any(|gap| gap.reason == GapReason::Budget));
+    }
+}
+
+#[test]
 fn a_full_queue_refuses_records_and_marks_them() {
     let disk = SimulatedDisk::new(1);
     let mut writer = writer(&disk);

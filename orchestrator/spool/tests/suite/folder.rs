@@ -17,6 +17,14 @@ fn open(path: &Path) -> Result<SpoolWriter, SpoolError> {
     SpoolWriter::open(path, config(BUDGET_MIN))
 }
 
+/// Returns the writer of a stream with one record.
+fn written(path: &Path) -> SpoolWriter {
+    let mut writer = open(path).unwrap();
+    writer.append(KIND, TIME, b"one").unwrap();
+    writer.commit().unwrap();
+    writer
+}
+
 #[test]
 fn a_second_writer_is_refused_with_the_process_of_the_first() {
     let scratch = tempfile::tempdir().unwrap();
@@ -32,9 +40,7 @@ fn a_second_writer_is_refused_with_the_process_of_the_first() {
 #[test]
 fn records_are_read_back_from_the_disk() {
     let scratch = tempfile::tempdir().unwrap();
-    let mut writer = open(scratch.path()).unwrap();
-    writer.append(KIND, TIME, b"one").unwrap();
-    writer.commit().unwrap();
+    let _writer = written(scratch.path());
     fs::write(scratch.path().join("notes.txt"), "not a segment").unwrap();
     let read: Vec<_> = SpoolReader::open(scratch.path(), STREAM, None).unwrap().collect();
     let [Ok(SpoolItem::Record(record))] = &read[..] else { panic!("{read:?}") };
@@ -89,9 +95,7 @@ fn links_pipes_and_files_of_others_are_refused_without_blocking() {
 fn a_writer_whose_folder_is_removed_acknowledges_nothing() {
     let scratch = tempfile::tempdir().unwrap();
     let path = scratch.path().join("logs");
-    let mut writer = open(&path).unwrap();
-    writer.append(KIND, TIME, b"one").unwrap();
-    writer.commit().unwrap();
+    let mut writer = written(&path);
     fs::remove_dir_all(&path).unwrap();
     // Another writer begins the stream again.
     let mut other = open(&path).unwrap();
@@ -106,9 +110,7 @@ fn a_writer_whose_folder_is_removed_acknowledges_nothing() {
 #[test]
 fn a_writer_whose_files_are_removed_begins_a_segment_or_reports_the_lost_lock() {
     let scratch = tempfile::tempdir().unwrap();
-    let mut writer = open(scratch.path()).unwrap();
-    writer.append(KIND, TIME, b"one").unwrap();
-    writer.commit().unwrap();
+    let mut writer = written(scratch.path());
     fs::remove_file(scratch.path().join("00000000000000000000.seg")).unwrap();
     writer.append(KIND, TIME, b"two").unwrap();
     assert_eq!(writer.commit().unwrap(), 2);
@@ -140,9 +142,7 @@ fn a_writer_and_a_reader_stay_with_a_folder_that_is_renamed() {
 fn other_users_can_neither_read_nor_lock_a_stream() {
     let scratch = tempfile::tempdir().unwrap();
     let path = scratch.path().join("streams/logs");
-    let mut writer = open(&path).unwrap();
-    writer.append(KIND, TIME, b"one").unwrap();
-    writer.commit().unwrap();
+    let writer = written(&path);
     let mode = |path: &Path| fs::metadata(path).unwrap().permissions().mode() & 0o777;
     assert_eq!(mode(&path), 0o700);
     for entry in fs::read_dir(&path).unwrap() {

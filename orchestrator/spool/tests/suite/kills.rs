@@ -14,7 +14,6 @@ use crate::simulated::SpoolRandom;
 
 const FOLDER: &str = "GLEANER_SPOOL_OF_A_CHILD";
 
-/// The payload of a record, by its number.
 fn payload(seq: u64) -> Vec<u8> {
     vec![seq as u8; (seq * 37 % 300) as usize]
 }

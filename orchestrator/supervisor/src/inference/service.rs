@@ -47,7 +47,6 @@ const DIGEST: usize = 64;
 /// Time after which a process was healthy: earlier ends do not count any more.
 const HEALTHY: Duration = Duration::from_secs(60);
 
-/// Interval of looks at the process.
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
 
 type Events = Arc<dyn Fn(InferenceEvent) + Send + Sync>;

@@ -85,7 +85,6 @@ impl Connection {
         }
     }
 
-    /// Returns whether an orchestrator is connected.
     pub(super) fn is_open(&self) -> bool {
         lock(&self.shared.newest).1.is_some()
     }
@@ -175,7 +174,7 @@ fn send(mut stream: &UnixStream, report: &SupervisorReport) {
 fn welcome() -> SupervisorReport {
     SupervisorReport::Welcome(Welcome {
         version: SUPERVISION_VERSION,
-        program: env!("CARGO_PKG_VERSION").to_owned(),
+        program: gleaner_base::version().to_owned(),
         pid: std::process::id(),
     })
 }

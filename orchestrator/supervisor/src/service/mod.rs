@@ -17,9 +17,23 @@ use std::process::ExitCode;
 
 use gleaner_base::{Exit, Failure};
 
+const HELP: &str = "Starts and supervises the processes of a vehicle
+
+`gleaner-orchestrator` starts it; see docs/vehicle.md
+
+Usage: gleaner-supervisor
+
+Options:
+  -h, --help     Print help
+  -V, --version  Print version";
+
 /// Runs the program `gleaner-supervisor`. Its standard input is a socket that listens for the
 /// orchestrator, and its standard output a file whose lock it holds while it runs.
 pub fn main() -> ExitCode {
+    if let Some(answer) = std::env::args_os().nth(1).and_then(|it| answer(it.to_str()?)) {
+        println!("{answer}");
+        return Exit::Ok.into();
+    }
     // Fails if it has a session already. A signal to that of its starter does not reach it.
     let _ = rustix::process::setsid();
     // Each lambda takes several.
@@ -29,6 +43,15 @@ pub fn main() -> ExitCode {
         eprintln!("{failure}");
     }
     ended.map_or_else(|failure| failure.exit.code(), |()| Exit::Ok.code()).into()
+}
+
+/// Returns the answer to the only arguments that it has.
+fn answer(argument: &str) -> Option<String> {
+    match argument {
+        "-h" | "--help" => Some(HELP.to_owned()),
+        "-V" | "--version" => Some(format!("gleaner-supervisor {}", gleaner_base::version())),
+        _ => None,
+    }
 }
 
 fn listener() -> Result<UnixListener, Failure> {
@@ -42,5 +65,18 @@ fn listener() -> Result<UnixListener, Failure> {
     match listens.map_err(|error| unusable(&std::io::Error::from(error)))? {
         true => Ok(UnixListener::from(stdin)),
         false => Err(unusable(&std::io::Error::other("it does not listen"))),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_version_and_the_help_need_no_socket() {
+        let version = answer("--version").unwrap();
+        assert_eq!(version, format!("gleaner-supervisor {}", gleaner_base::version()));
+        assert!(answer("--help").unwrap().contains("gleaner-orchestrator"));
+        assert_eq!(answer("--other"), None);
     }
 }

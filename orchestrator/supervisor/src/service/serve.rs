@@ -154,7 +154,6 @@ fn run_spec(spec: &SupervisionSpec) -> Result<RunSpec, Failure> {
     })
 }
 
-/// The state that the orchestrator wants.
 struct WantedState<'a> {
     spec: &'a SupervisionSpec,
     installation: Installation,

@@ -1,7 +1,5 @@
 //! Tests of checks that fail, without any process.
 
-use std::path::PathBuf;
-
 use gleaner_protocol::ingress::{IngressReport, IngressStatus};
 use gleaner_protocol::link::RecorderReport;
 use gleaner_protocol::supervision::DesiredLambda;
@@ -36,10 +34,8 @@ fn checked(is_shortage: bool) -> (SupervisedLambda, Vec<String>) {
         id: "id".to_owned(),
         name: "id".to_owned(),
         revision: "a".repeat(64),
-        folder: PathBuf::new(),
-        envelope: PathBuf::new(),
-        set: Vec::new(),
         attempt: 1,
+        ..DesiredLambda::default()
     }));
     let mut lambda = SupervisedLambda::new(spec);
     let failure = CheckFailure { reason: "no open files are left".to_owned(), is_shortage };

@@ -124,7 +124,7 @@ impl ClipSigner {
     }
 }
 
-/// RestPlaces in a file, from the attachment on.
+/// Places in a file, from the attachment on.
 struct RestPlaces {
     envelope: Range<usize>,
     /// Checksum of the attachment.

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use gleaner_base::{ByteSize, Exit, Explain, NotPlain, PlainFile, excerpt};
-use serde::{Serialize, Serializer};
+use serde::Serialize;
 
 use crate::PublicKey;
 
@@ -16,7 +16,7 @@ const FILE_MAX: ByteSize = ByteSize::mib(1);
 const NAME_MAX: usize = 64;
 
 /// Name of a vehicle: 1 to 64 letters of ASCII, digits, `.`, `_` and `-`.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 pub struct VehicleName(String);
 
 impl VehicleName {
@@ -49,12 +49,6 @@ impl FromStr for VehicleName {
 impl fmt::Display for VehicleName {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(&self.0)
-    }
-}
-
-impl Serialize for VehicleName {
-    fn serialize<S: Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
-        to.serialize_str(&self.0)
     }
 }
 
@@ -101,7 +95,6 @@ impl TrustedVehicles {
         Ok(Self(vehicles))
     }
 
-    /// Returns all keys.
     pub(super) fn keys(&self) -> impl Iterator<Item = &PublicKey> {
         self.0.iter().map(|(_, key)| key)
     }

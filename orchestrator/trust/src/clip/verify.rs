@@ -53,7 +53,6 @@ pub fn verify_clip(clip: impl Read, vehicles: &TrustedVehicles) -> Result<Signed
     }
 }
 
-/// The attachment with the signature.
 struct SignatureAttachment {
     envelope: Vec<u8>,
     wrong_checksum: Option<&'static str>,

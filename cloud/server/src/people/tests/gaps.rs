@@ -37,6 +37,31 @@ async fn piece(body: &mut BodyDataStream) -> Vec<Value> {
 }
 
 #[tokio::test]
+async fn events_of_two_streams_come_in_the_order_of_their_times() {
+    let (_folder, cloud) = cloud().await;
+    let token = token_of(&cloud, "ann", Role::Viewer).await;
+    let epoch = connected(&cloud.store, CAR).await;
+    for (stream, time) in [("events", 5), ("orchestrator", 4)] {
+        let cursor = Cursor { stream: stream.to_owned(), life: 1, next: 1, ..Cursor::default() };
+        let line = json!({ "stream": stream, "seq": 0, "time_ns": time, "kind": "event" });
+        let lines = vec![(0, String::new(), line.to_string())];
+        let batch = StreamBatch { lines, cursor };
+        cloud.store.append(CAR, epoch, batch, Retention::DEFAULT).await.unwrap();
+    }
+    let path = (Method::GET, "/v1/vehicles/car-7/events");
+    let text = String::from_utf8(send(&cloud, path, Some(&token), &[], "").await.body).unwrap();
+    let line = |line| serde_json::from_str::<Value>(line).unwrap();
+    let times: Vec<_> = text.lines().map(|text| line(text)["time_ns"].clone()).collect();
+    assert_eq!(times, [4, 5]);
+    // As server-sent events, only the last one has a position: another one may come before it.
+    let sse: &[_] = &[("accept", "text/event-stream")];
+    let path = (Method::GET, "/v1/vehicles/car-7/events");
+    let text = String::from_utf8(send(&cloud, path, Some(&token), sse, "").await.body).unwrap();
+    assert_eq!(text.matches("id: ").count(), 1, "{text}");
+    assert!(text.find("\"time_ns\":4") < text.find("id: 2\n"), "{text}");
+}
+
+#[tokio::test]
 async fn a_carriage_return_splits_no_event() {
     let (_folder, cloud) = cloud().await;
     let token = token_of(&cloud, "ann", Role::Viewer).await;

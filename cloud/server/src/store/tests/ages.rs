@@ -1,7 +1,5 @@
 use super::*;
 
-const DAY_S: i64 = 86_400;
-
 #[tokio::test]
 async fn a_clock_that_is_set_removes_nothing_and_ages_are_measured() {
     let (_folder, store) = store().await;

@@ -32,6 +32,16 @@ async fn vehicles_of_a_deployment_are_counted_by_what_they_report() {
         store.report("car-7", epoch, report(json!({}), deployments)).await.unwrap();
         assert_eq!(counts().await, expected);
     }
+    // Its wakes fault, and it has no fallback: proven, of an earlier attempt, in its probation.
+    let mut faulty = status(Value::Null, "running", &envelope);
+    faulty[0]["status"]["recent"] = json!({ "wakes": 20, "faults": 10, "backed_off": 0 });
+    for (is_proven, attempt, running) in [(true, 1, 1), (false, 2, 1), (false, 1, 0)] {
+        faulty[0]["is_proven"] = json!(is_proven);
+        faulty[0]["attempt"] = json!(attempt);
+        store.report("car-7", epoch, report(json!({}), faulty.clone())).await.unwrap();
+        assert_eq!(counts().await, (2, running, 1 - running));
+    }
+    assert!(store.reports("a", &envelope, 9).await.unwrap()[0].2.starts_with("10 of its last 20"));
     // Another deployment of the same number, with and without a problem of this one, of another
     // one, and with one that could only not be fetched yet.
     let other = status(Value::Null, "running", "other");

@@ -27,6 +27,7 @@ struct TestFleet {
 impl TestFleet {
     async fn of(vehicles: usize) -> Self {
         let (folder, store) = store().await;
+        store.begin_lease("", false).await.unwrap();
         let mut epochs = BTreeMap::new();
         for number in 0..vehicles {
             let name = format!("car-{number}");
@@ -53,15 +54,14 @@ impl TestFleet {
         names
     }
 
-    /// Lets vehicles report a release.
     async fn report(&self, names: &[String], number: u64, failed: Option<&str>) {
         for name in names {
             let deployment = json!([{
                 "id": "a", "release": number, "envelope": envelope(number), "attempt": 1, "lambda": "a",
                 "revision": { "digest": "r", "version": "1", "release": 1 }, "fallback": null,
                 "grants": { "topics": [], "models": [], "record": false }, "is_wanted": true,
-                "runs_fallback": false, "is_proven": false, "failed": failed, "refused": null,
-                "stale": null,
+                "runs_fallback": failed.is_some(), "is_proven": false, "failed": failed,
+                "refused": null, "stale": null,
                 "status": { "id": "a", "name": "a", "revision": "r", "attempt": 1,
                     "phase": "running", "phase_s": 1.0, "pid": null, "restarts": 0,
                     "last_end": null, "live": null, "layers": [] },
@@ -151,6 +151,11 @@ async fn waves_stop_at_failures_until_a_person_resumes_them() {
     let progress = fleet.progress().await;
     assert_eq!(progress.state, WaveState::Paused);
     assert_eq!(progress.reason, format!("failed on 1 of 2 ({}: it faults)", first[1]));
+    // The fallback runs there: that is no success.
+    let stored = fleet.store.deployment("a").await.unwrap();
+    assert_eq!((stored.running, stored.failed, stored.on_fallback), (1, 1, 1));
+    let reports = fleet.store.reports("a", &envelope(2), 9).await.unwrap();
+    assert_eq!(reports[0], (first[1].clone(), "fallback".to_owned(), "it faults".to_owned()));
     assert!(fleet.store.advance_waves().await.unwrap().is_empty());
     assert_eq!(fleet.having(2).await, first);
     // Who resumes them accepts the failures so far.
@@ -235,18 +240,29 @@ async fn a_wave_waits_for_its_soak_time_and_pauses_at_its_deadline() {
 
 #[tokio::test]
 async fn a_wave_does_not_wait_for_vehicles_that_are_switched_off() {
-    let fleet = TestFleet::of(4).await;
+    let fleet = TestFleet::of(6).await;
     fleet.deploy(2, WavePlan { shares: vec![50], ..PLAN }).await;
     let first = fleet.having(2).await;
-    fleet.report(&first[..1], 2, None).await;
-    fleet.store.execute("UPDATE vehicles SET seen = seen - 100000").await;
-    assert!(fleet.store.advance_waves().await.unwrap().is_empty(), "it may connect soon");
+    // Of the two that are switched off then, one has run it.
+    fleet.report(&first[..2], 2, None).await;
+    let others = "UPDATE vehicles SET seen = seen - 100000, replica = '' WHERE name <> $1";
+    fleet.store.execute_with(others, &[&first[0]]).await;
+    assert!(fleet.store.advance_waves().await.unwrap().is_empty(), "they may connect soon");
     fleet.pass(AWAY_S + 1).await;
-    assert_eq!(fleet.store.advance_waves().await.unwrap().len(), 2);
-    // Nothing succeeds without any vehicle that runs it.
-    fleet.deploy(3, WavePlan { shares: vec![50], ..PLAN }).await;
+    assert_eq!(fleet.store.advance_waves().await.unwrap().len(), 3);
+    // Nothing succeeds without any vehicle that runs it, or with one that has fallen silent since.
+    fleet.deploy(3, WavePlan { shares: vec![10], ..PLAN }).await;
     fleet.pass(AWAY_S + 1).await;
     assert!(fleet.store.advance_waves().await.unwrap().is_empty());
+    let canary = fleet.having(3).await;
+    fleet.report(&canary, 3, None).await;
+    fleet.store.execute_with(others, &[""]).await;
+    assert!(fleet.store.advance_waves().await.unwrap().is_empty());
+    assert_eq!(fleet.store.deployment("a").await.unwrap().running, 1, "as it was reported");
+    fleet.pass(3600).await;
+    fleet.store.advance_waves().await.unwrap();
+    let end = format!("0 of 1 at its deadline ({}: not connected since the soak time)", canary[0]);
+    assert!(fleet.progress().await.reason.ends_with(&end));
 }
 
 #[tokio::test]

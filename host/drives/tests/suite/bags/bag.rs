@@ -22,7 +22,6 @@ pub const TABLES: &str = "\
     NOT NULL, data BLOB NOT NULL);\
     CREATE INDEX timestamp_idx ON messages (timestamp ASC);";
 
-/// The packing of a directory.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum Packing {
     No,

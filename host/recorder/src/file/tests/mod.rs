@@ -45,7 +45,6 @@ impl TestDir {
         RecordingFolder::open(&self.0).unwrap()
     }
 
-    /// Returns the listed clips.
     fn listed(&self) -> Vec<Clip> {
         let text = fs::read_to_string(self.path("clips.jsonl")).unwrap_or_default();
         text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()

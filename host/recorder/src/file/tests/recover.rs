@@ -35,7 +35,6 @@ fn files(clips: &[Clip]) -> Vec<&str> {
     clips.iter().map(|clip| clip.file.to_str().unwrap()).collect()
 }
 
-/// Returns the recovery of unfinished clips.
 fn recovery(scratch: &TestDir) -> Recovery {
     RecordingFolder::open_without_recovery(&scratch.0).unwrap().take_unfinished()
 }

@@ -93,7 +93,6 @@ fn every_changed_removed_added_or_cut_byte_is_refused() {
     }
 }
 
-/// Returns the place of the envelope in a clip.
 fn envelope(clip: &[u8]) -> std::ops::Range<usize> {
     let summary = mcap::Summary::read(clip).unwrap().unwrap();
     let index = summary.attachment_indexes.last().unwrap();

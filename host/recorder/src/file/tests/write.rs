@@ -13,16 +13,7 @@ use super::super::unfinished::METADATA_MAX;
 use super::super::{ClipTrailer, MESSAGE_MAX, UnfinishedClip};
 use super::*;
 use crate::error::RecordError;
-
-/// Returns all metadata records of a finished clip, read by the `mcap` crate.
-fn metadata(file: &[u8]) -> Vec<(String, BTreeMap<String, String>)> {
-    let records = mcap::read::LinearReader::new(file).unwrap();
-    let metadata = records.filter_map(|record| match record.unwrap() {
-        mcap::records::Record::Metadata(metadata) => Some((metadata.name, metadata.metadata)),
-        _ => None,
-    });
-    metadata.collect()
-}
+use crate::support::metadata;
 
 fn named<'a>(
     records: &'a [(String, BTreeMap<String, String>)],

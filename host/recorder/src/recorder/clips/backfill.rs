@@ -31,7 +31,6 @@ impl Budget {
 /// A backfill in progress.
 #[derive(Debug)]
 pub struct Backfill {
-    /// The windows for which it is made.
     windows: Vec<Window>,
     /// Later entries are not needed.
     limit: i64,

@@ -34,7 +34,6 @@ pub struct ClipsInProgress {
     backfill: Option<Backfill>,
     /// The last entry before the messages that could not be written to `open` when they came.
     behind: Option<Option<Walked>>,
-    /// Number of groups of windows so far.
     groups: u64,
     max_length_ns: i64,
     finished: Finished,
@@ -348,7 +347,6 @@ impl ClipsInProgress {
         self.fill_late(clip, Vec::new(), group, material)
     }
 
-    /// Completes a clip.
     fn end(
         &mut self,
         mut clip: OpenClip,
@@ -366,7 +364,6 @@ impl ClipsInProgress {
         Ok(())
     }
 
-    /// An empty clip of `group`.
     fn new_clip(&mut self, group: &Group, material: &Material) -> OpenClip {
         self.groups += 1;
         let (lambda, at_ns) = group.first;

@@ -27,7 +27,6 @@ const SPARE: usize = 16;
 /// start.
 const RECOVERY: Duration = Duration::from_secs(5);
 
-/// A job of the thread.
 struct WriterJob {
     clip: u64,
     /// Bytes that it takes while it is queued.
@@ -45,14 +44,12 @@ enum ClipWork {
     Finish(Box<ClipCompletion>),
 }
 
-/// A message to the thread.
 enum WriterMessage {
     Job(WriterJob),
     /// No further job comes.
     End,
 }
 
-/// The result of a job.
 enum JobResult {
     Nothing,
     Clip(ClipOutcome),
@@ -228,7 +225,6 @@ pub struct QueuedClip {
     clip: u64,
     jobs: Sender<WriterMessage>,
     flow: Arc<Flow>,
-    /// Messages that are sent together.
     batch: Batch,
     is_finished: bool,
 }
@@ -304,7 +300,6 @@ fn gone() -> RecordError {
     RecordError::Thread { source: io::Error::other("the thread that writes clips has ended") }
 }
 
-/// The state of the thread.
 struct WriterLoop {
     folder: RecordingFolder,
     open: Vec<(u64, ClipFile)>,

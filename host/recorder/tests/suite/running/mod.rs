@@ -41,7 +41,6 @@ pub const TIMEOUT: Duration = Duration::from_secs(60);
 #[derive(Clone, Default)]
 pub struct FakeNetwork {
     pub loopback: Loopback,
-    /// The subscriptions.
     pub specs: Arc<Mutex<Vec<TopicSpec>>>,
     /// The hash of the layout that writers announce.
     pub announced: Arc<Mutex<Option<String>>>,

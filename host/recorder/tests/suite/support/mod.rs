@@ -79,7 +79,6 @@ impl TestDir {
         contents
     }
 
-    /// The attachments of a clip, by name.
     pub fn attachments(&self, clip: &Clip) -> BTreeMap<String, Vec<u8>> {
         let bytes = fs::read(self.0.join(&clip.file)).unwrap();
         let records = mcap::read::LinearReader::new(&bytes).unwrap();
@@ -92,15 +91,8 @@ impl TestDir {
         found
     }
 
-    /// The metadata records of a clip.
     pub fn metadata(&self, clip: &Clip) -> Vec<(String, BTreeMap<String, String>)> {
-        let bytes = fs::read(self.0.join(&clip.file)).unwrap();
-        let records = mcap::read::LinearReader::new(&bytes).unwrap().map(Result::unwrap);
-        let metadata = records.filter_map(|record| match record {
-            mcap::records::Record::Metadata(metadata) => Some((metadata.name, metadata.metadata)),
-            _ => None,
-        });
-        metadata.collect()
+        metadata(&fs::read(self.0.join(&clip.file)).unwrap())
     }
 
     /// The channels of a clip: topics, each as often as it has one, sorted.
@@ -130,6 +122,16 @@ impl Drop for TestDir {
     fn drop(&mut self) {
         let _ = fs::remove_dir_all(&self.0);
     }
+}
+
+/// Returns all metadata records of a finished clip, read by the `mcap` crate.
+pub fn metadata(file: &[u8]) -> Vec<(String, BTreeMap<String, String>)> {
+    let records = mcap::read::LinearReader::new(file).unwrap();
+    let metadata = records.filter_map(|record| match record.unwrap() {
+        mcap::records::Record::Metadata(metadata) => Some((metadata.name, metadata.metadata)),
+        _ => None,
+    });
+    metadata.collect()
 }
 
 /// Topic, stamp, number and bytes.

@@ -14,9 +14,11 @@ use gleaner_spool::{BUDGET_MIN, BootId, SegmentFile, SpoolConfig, SpoolTime, Spo
 use serde_json::Value;
 use tempfile::TempDir;
 use tokio::sync::mpsc::{Receiver as FrameReceiver, channel};
-use tokio::time::timeout;
+use tokio::task::JoinHandle;
+use tokio::time::{sleep, timeout};
 
 use super::*;
+use crate::cloud::LinkState;
 use crate::durable::DurableFile;
 use simulated::{DiskFault, SimulatedDisk};
 
@@ -43,6 +45,14 @@ struct StoredRecords {
     cursors: BTreeMap<String, Cursor>,
     /// The lines of each stream as they came, with their lives.
     lines: BTreeMap<String, Vec<(u64, StreamLine)>>,
+}
+
+/// A connection of a vehicle, as its cloud and its users see it.
+struct OpenUplink {
+    frames: FrameReceiver<Body>,
+    orders: mpsc::SyncSender<UplinkOrder>,
+    sent: JoinHandle<()>,
+    view: Cloud,
 }
 
 #[derive(Clone, Copy)]
@@ -126,18 +136,21 @@ impl Spools {
         reader.map(|item| parse(line(of, item))).collect()
     }
 
+    /// Opens a connection to a cloud that has `cursors`.
+    fn open(&self, cursors: BTreeMap<String, Cursor>) -> OpenUplink {
+        let (out, frames) = channel(4);
+        let (orders, received) = mpsc::sync_channel(STREAMS_HERE.len());
+        let cloud = Cloud::load(DurableFile::new(self.path("cloud.json"))).0;
+        cloud.set_state(LinkState::Connected, None, None);
+        let (spool, view) = (self.folder.path().to_owned(), cloud.clone());
+        let uplink = Uplink { spool, cloud, cursors, out, orders: received };
+        let sent = tokio::task::spawn_blocking(move || uplink.run());
+        OpenUplink { frames, orders, sent, view }
+    }
+
     /// Sends to a cloud over one connection.
     async fn connect(&self, cloud: &mut StoredRecords, end: LinkCut) {
-        let (out, mut frames) = channel(4);
-        let (orders, received) = mpsc::sync_channel(STREAMS_HERE.len());
-        let uplink = Uplink {
-            spool: self.folder.path().to_owned(),
-            cloud: Cloud::load(DurableFile::new(self.path("cloud.json"))).0,
-            cursors: cloud.cursors.clone(),
-            out,
-            orders: received,
-        };
-        let sent = tokio::task::spawn_blocking(move || uplink.run());
+        let OpenUplink { mut frames, orders, sent, .. } = self.open(cloud.cursors.clone());
         let mut batches = 0;
         while !self.are_in(cloud) {
             let batch = batch(&mut frames).await;
@@ -332,6 +345,34 @@ async fn what_the_budget_removes_after_the_cloud_has_it_is_no_gap() {
     let arrived = cloud.of_life("lambdas/brake", 1, 0);
     assert!(gaps(&arrived).is_empty(), "{:?}", gaps(&arrived));
     assert!(arrived.iter().map(|line| line.seq).eq(0..1200_u64));
+}
+
+#[tokio::test]
+async fn a_stream_that_cannot_be_read_is_named_until_it_is_gone() {
+    let mut vehicle = Spools::new();
+    vehicle.boot(0);
+    vehicle.add("events", 0, 5, 5);
+    let odd = vehicle.path("lambdas/odd");
+    std::fs::write(&odd, "no folder").unwrap();
+    let mut uplink = vehicle.open(BTreeMap::new());
+    batch(&mut uplink.frames).await;
+    let until = async |has_reason| {
+        while uplink.view.lock().reason.is_some() != has_reason {
+            sleep(Duration::from_millis(2)).await;
+        }
+    };
+    timeout(DEADLINE, until(true)).await.expect("it is named beside the number");
+    assert_eq!(uplink.view.lock().unsent, 5);
+    let reason = uplink.view.lock().reason.clone().unwrap();
+    assert!(reason.starts_with("stream `lambdas/odd` cannot be sent"), "{reason}");
+    std::fs::remove_file(odd).unwrap();
+    timeout(DEADLINE, until(false)).await.expect("it is named until it is removed");
+    let lambdas = vehicle.path("lambdas");
+    std::fs::rename(&lambdas, vehicle.path("moved")).unwrap();
+    std::fs::write(&lambdas, "no folder").unwrap();
+    timeout(DEADLINE, until(true)).await.expect("the folder of all is named");
+    drop(uplink.frames);
+    uplink.sent.await.unwrap();
 }
 
 /// Writes ten records in two segments without a sync, as commits in progress. Returns their

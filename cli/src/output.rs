@@ -1,4 +1,6 @@
-//! Prints to standard output.
+//! Prints to standard output and standard error. All text passes [`Paint::escaped`] here, so that
+//! nothing that a vehicle, a cloud or a lambda has sent acts on a terminal; a [`Failure`] and
+//! [`json_line`] escape by themselves. `run` and `top` have writers for their terminals.
 
 use std::io::{self, ErrorKind, Write};
 use std::thread;
@@ -6,15 +8,42 @@ use std::thread;
 use gleaner_base::{Exit, Failure};
 use rustix::event::{PollFd, PollFlags, poll};
 use rustix::io::Errno;
+use serde::Serialize;
 
-/// Prints all of `text`. A closed pipe is not an error, since the effect of a command does not
-/// depend on its reader.
+use crate::render::{Paint, json_line};
+
+/// Prints all of `text`, escaped. A closed pipe is not an error, since the effect of a command does
+/// not depend on its reader.
 pub(crate) fn print(text: &str) -> Result<(), Failure> {
-    print_to_reader(text).map(drop)
+    write(&Paint::of_stdout().escaped(text)).map(drop)
 }
 
-/// Prints all of `text`; returns false if standard output is a pipe that its reader has closed.
-pub(crate) fn print_to_reader(text: &str) -> Result<bool, Failure> {
+/// Prints a line of JSON; returns false if standard output is a pipe that its reader has closed.
+pub(crate) fn print_json(result: &impl Serialize) -> Result<bool, Failure> {
+    write(&json_line(result))
+}
+
+/// Prints a result as JSON or as text.
+pub(crate) fn show<T: Serialize>(
+    json: bool,
+    result: &T,
+    text: impl FnOnce(&T) -> String,
+) -> Result<Exit, Failure> {
+    if json {
+        print_json(result)?;
+    } else {
+        print(&text(result))?;
+    }
+    Ok(Exit::Ok)
+}
+
+/// Prints all of `text` to standard error, escaped. An error of standard error itself cannot be
+/// reported.
+pub(crate) fn print_error(text: &str) {
+    let _ = io::stderr().write_all(Paint::of_stderr().escaped(text).as_bytes());
+}
+
+fn write(text: &str) -> Result<bool, Failure> {
     let mut out = io::stdout().lock();
     match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
         Ok(()) => Ok(true),
