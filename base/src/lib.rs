@@ -25,7 +25,7 @@ pub use discovery::ignored_variables;
 pub use exit::Exit;
 pub use failure::{Explain, Failure, chain};
 pub use line_pieces::{LinePiece, each_piece};
-pub use open_files::raise_open_files;
+pub use open_files::{open_files_max, raise_open_files};
 pub use plain_file::{NotPlain, PlainFile};
 pub use rate_limit::RateLimit;
 pub use shortage::is_shortage;

@@ -17,10 +17,15 @@ impl RateLimit {
         RateLimit { per_s, burst, left: burst, since: None }
     }
 
+    /// Returns how much is left.
+    pub fn left(&self, now: Instant) -> f64 {
+        let passed = self.since.map_or(0.0, |since| now.duration_since(since).as_secs_f64());
+        (self.left + passed * self.per_s).min(self.burst)
+    }
+
     /// Takes `amount` and returns true, if that much is left.
     pub fn take(&mut self, amount: f64, now: Instant) -> bool {
-        let passed = self.since.map_or(0.0, |since| now.duration_since(since).as_secs_f64());
-        self.left = (self.left + passed * self.per_s).min(self.burst);
+        self.left = self.left(now);
         self.since = Some(now);
         let fits = amount <= self.left;
         self.left -= if fits { amount } else { 0.0 };

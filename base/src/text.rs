@@ -44,6 +44,12 @@ pub fn excerpt(text: &str) -> String {
     }
 }
 
+/// Formats a failed action and its causes in one line, safe to print.
+pub fn in_words(action: &str, causes: &[String]) -> String {
+    let parts = std::iter::once(action).chain(causes.iter().map(String::as_str));
+    parts.map(visible).collect::<Vec<_>>().join(": ")
+}
+
 /// Formats a text of several lines as one, safe to print. Of a Python traceback, the last line
 /// counts: the type and the message of the exception.
 pub fn in_one_line(text: &str) -> String {

@@ -20,7 +20,6 @@ const TOKEN_VARIABLE: &str = "GLEANER_CLOUD_TOKEN";
 /// Longest file; one has some hundred bytes.
 const FILE_MAX: ByteSize = ByteSize::kib(64);
 
-/// The help without a token.
 pub(crate) const LOGIN_HELP: &str = "log in: `gleaner login URL --code CODE`; an admin of the \
     cloud makes a code with `gleaner users invite NAME --role ROLE`";
 

@@ -17,7 +17,7 @@ use gleaner_parts::{Parts, cache_dir};
 use gleaner_protocol::inference::{
     InferenceReport, ModelCall, ModelClient, ModelState, engine_file,
 };
-use gleaner_supervisor::{InferenceEvent, InferenceService};
+use gleaner_supervisor::{InferenceEvent, InferenceService, InferenceUse};
 use serde::Serialize;
 
 use crate::output::{print, print_error, print_json};
@@ -148,7 +148,8 @@ impl EngineBuild<'_> {
             ..InferenceLimits::default()
         };
         // Sending fails only after the end of the build.
-        let service = InferenceService::start(self.parts, &limits, Some(folder), move |event| {
+        let purpose = InferenceUse::Engines(folder);
+        let service = InferenceService::start(self.parts, &limits, purpose, move |event| {
             drop(sender.send(event));
         })?;
         let mut model = self.model.clone();
@@ -179,12 +180,13 @@ impl EngineBuild<'_> {
                         )),
                     };
                 }
-                Ok(InferenceEvent::Ended(reason, _)) => {
+                Ok(InferenceEvent::Ended(reason, ..)) => {
                     return Err(self.failed(visible(&reason)).with_help(SMALLER));
                 }
                 Ok(InferenceEvent::Stderr(text)) => print_error(&String::from_utf8_lossy(&text)),
                 Ok(InferenceEvent::Warning(text)) => self.show(&text),
-                Ok(InferenceEvent::Report(_)) | Err(RecvTimeoutError::Timeout) => {}
+                Ok(InferenceEvent::Report(_) | InferenceEvent::Refused(_))
+                | Err(RecvTimeoutError::Timeout) => {}
                 Err(RecvTimeoutError::Disconnected) => {
                     return Err(self.failed("its process is not supervised"));
                 }

@@ -23,7 +23,6 @@ pub(crate) fn print_json(result: &impl Serialize) -> Result<bool, Failure> {
     write(&json_line(result))
 }
 
-/// Prints a result as JSON or as text.
 pub(crate) fn show<T: Serialize>(
     json: bool,
     result: &T,

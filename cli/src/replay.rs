@@ -19,7 +19,6 @@ use crate::runtime::{self, RuntimeResult};
 use crate::separate;
 use crate::signing;
 
-/// Replays; returns the exit code of the runtime.
 pub(crate) fn run(args: &ReplayArgs) -> Result<Exit, Failure> {
     results(args).map(|(exit, _)| exit)
 }
@@ -131,7 +130,6 @@ pub(crate) fn verify(args: &VerifyArgs) -> Result<Exit, Failure> {
     Ok(exit)
 }
 
-/// Prints the result of the runtime, and returns its exit code.
 pub(crate) fn print_result(
     (result, exit): (Option<RuntimeResult>, Exit),
     json: bool,

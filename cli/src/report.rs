@@ -32,7 +32,6 @@ pub(crate) fn run(args: &ReportArgs) -> Result<Exit, Failure> {
     Ok(first)
 }
 
-/// Writes the report of the run in `out` to `out`.
 pub(crate) fn write(out: &Path) -> Result<PathBuf, Failure> {
     save(&ReportPage::of(out)?, out.join(NAME))
 }

@@ -16,7 +16,7 @@ use gleaner_lambda::{BuildDir, InferenceLimits, Vehicle};
 use gleaner_parts::Parts;
 use gleaner_protocol::{CheckReport, Handover, PASSES_INFERENCE, ReplaySummary, Report, Verified};
 use gleaner_supervisor::lines::{next_report, pass_on};
-use gleaner_supervisor::{InferenceEvent, InferenceService, starter};
+use gleaner_supervisor::{InferenceEvent, InferenceService, InferenceUse, starter};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use crate::output::print_error;
@@ -149,7 +149,8 @@ impl ModelsOfRun {
     ) -> Result<Self, Failure> {
         let (bar, has_failed) = (bar.clone(), Arc::new(AtomicBool::new(false)));
         let failed = Arc::clone(&has_failed);
-        let service = InferenceService::start(parts, limits, None, move |event| {
+        let purpose = InferenceUse::OneLambda;
+        let service = InferenceService::start(parts, limits, purpose, move |event| {
             if matches!(event, InferenceEvent::Ended(..)) {
                 failed.store(true, Ordering::Relaxed);
             }

@@ -93,7 +93,7 @@ fn orders(bytes: &[u8]) -> bool {
     let Ok(orders) = orders else { return false };
     for wanted in &orders.wanted {
         // A part that a vehicle would send lies within the file.
-        let length = ClipFacts::part_length(wanted.bytes, wanted.part);
+        let length = ClipFacts::piece_length(wanted.bytes, wanted.from.unwrap_or(0));
         assert!(length.is_none_or(|it| it <= CLIP_PART && it <= wanted.bytes));
     }
     true

@@ -1,5 +1,6 @@
 """Interrupts wakes that take too long: a signal raises an exception wherever the lambda is at that
-moment, for example in a loop, in ``time.sleep``, or in numpy when its operation ends.
+moment, for example in a loop, in ``time.sleep``, or in numpy when its operation ends. A wake that
+waited, for a core or a model, has time left; then the signal comes again.
 `gleaner-shim` kills a process that continues in spite of it."""
 
 from __future__ import annotations
@@ -7,6 +8,7 @@ from __future__ import annotations
 # The module that `signal` wraps. The wrapper converts numbers to enumerations and back, which takes
 # 55 us in a wake whose code is no longer in the caches.
 import _signal  # type: ignore[import-not-found]
+import sys
 from types import FrameType
 from typing import Optional
 
@@ -43,8 +45,13 @@ def disarm() -> bool:
     return _was_late
 
 
-def _on_alarm(_signal: int, _frame: Optional[FrameType]) -> None:
+def _on_alarm(_number: int, _frame: Optional[FrameType]) -> None:
     global _was_late
     if _is_armed:
+        left = sys.modules["_gleaner"].time_left()
+        if left:
+            # Not less than a millisecond: a thread that waits for a core gets little of it.
+            _signal.setitimer(_signal.ITIMER_REAL, max(left, 0.001), REPEAT_S)
+            return
         _was_late = True
         raise DeadlineExceeded("the deadline in [limits] of lambda.toml has passed")

@@ -6,6 +6,7 @@ import sys
 import tempfile
 import textwrap
 import unittest
+import unittest.mock
 from pathlib import Path
 from typing import Any, Dict
 
@@ -147,6 +148,19 @@ class WithoutHost(unittest.TestCase):
         def on_tick(ctx: Context) -> None: ...
 
         self.assertEqual(on_tick.__annotations__["ctx"], "Context")
+
+    def test_a_call_with_time_left_goes_on_after_its_signal(self) -> None:
+        # As the host states it at each signal: the call had to wait, and then used its time.
+        left = [0.001, 0.001, 0.0]
+        host = unittest.mock.Mock(time_left=lambda: left.pop(0))
+
+        def endless() -> None:
+            while True:
+                pass
+
+        with unittest.mock.patch.dict(sys.modules, _gleaner=host):
+            result, text, kind = _host.attempt(0.001, endless)
+        self.assertEqual((result, kind, left), (None, "deadline", []), text)
 
 
 if __name__ == "__main__":

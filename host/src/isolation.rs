@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
 use gleaner_base::{Exit, Failure, safe_file};
+use gleaner_jail::priority::leave_real_time;
 use gleaner_jail::{JailError, Paths, cgroup, files, memory, sandbox_filter, self_test};
 use gleaner_lambda::manifest::LambdaKind;
 use gleaner_parts::cache_dir;
@@ -56,6 +57,9 @@ impl Isolation {
             Pulse::inherited().map_err(|error| failed("cannot use the shim's page", &error))?;
         let has_shim = std::env::var_os(PULSE_ENV).is_some();
         die_with_parent(if has_shim { Signal::KILL } else { Signal::TERM })?;
+        // The shim has done so. Without it, threads are yet to be started.
+        leave_real_time()
+            .map_err(|error| failed("cannot give up the priority of real time", &error))?;
         // The signal is sent once, so an earlier end of the shim is checked here.
         let shim = std::env::var(SHIM_ENV).ok().filter(|_| has_shim);
         let parent = getppid().map(|parent| parent.as_raw_nonzero().to_string());

@@ -18,13 +18,11 @@ pub(super) const PAYLOAD_MAX: usize = 2 << 20;
 pub(super) mod kind {
     /// The header, as JSON: the first block only.
     pub(crate) const HEADER: u8 = 1;
-    /// Wakes.
     pub(crate) const WAKES: u8 = 2;
     /// The end, as JSON: the last block.
     pub(crate) const END: u8 = 3;
 }
 
-/// The head of a block, before its payload.
 pub(super) struct Head {
     pub(super) kind: u8,
     pub(super) len: u32,
@@ -32,7 +30,6 @@ pub(super) struct Head {
 }
 
 impl Head {
-    /// Encodes the head of block number `index`.
     pub(super) fn to_bytes(&self, index: u64) -> [u8; HEAD_LEN] {
         let mut bytes = [0; HEAD_LEN];
         bytes[0] = self.kind;

@@ -58,7 +58,6 @@ const FAULTS: [(FaultKind, &str); 8] = [
     (FaultKind::Killed, "killed"),
 ];
 
-/// Returns the index of `kind` in [`FAULTS`].
 fn fault_code(kind: FaultKind) -> usize {
     match kind {
         FaultKind::Fuel => 0,

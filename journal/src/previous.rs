@@ -15,7 +15,6 @@ pub(super) struct PreviousWake {
     pub(super) inputs: Vec<PreviousInput>,
 }
 
-/// One input in the previous wake.
 #[derive(Clone, Copy, Default)]
 pub(super) struct PreviousInput {
     pub(super) newest: Option<([u8; 16], u64)>,

@@ -31,7 +31,6 @@ pub struct JournalReader<R: Read> {
     state: ReadState,
 }
 
-/// The location of a block, for messages.
 #[derive(Clone, Copy, Default)]
 struct BlockLocation {
     offset: u64,

@@ -213,7 +213,6 @@ pub enum LayoutError {
     },
 }
 
-/// Help for a name that is not the name of a folder.
 const FOLDER_FIRST: &str = "name the lambda's folder, which has a lambda.toml; \
                             `replay` and `dev` take it before the drives";
 
@@ -314,15 +313,6 @@ mod tests {
         let build = BuildDir::check_fresh(dir.root()).unwrap();
         assert_eq!(build.path(), dir.path("build"));
         assert_eq!(build.manifest_path(), dir.path("build/lambda.toml"));
-    }
-
-    #[test]
-    fn the_entry_lies_in_the_build_folder() {
-        let text = "lambda = \
-                    { name = 'x', version = '0.1.0', kind = 'python', entry = 'main.py' }\n\
-                    schedule.period = '1s'";
-        let manifest = Manifest::parse(text, "lambda.toml").unwrap();
-        assert_eq!(BuildDir::of("x").entry_path(&manifest), Path::new("x/build/main.py"));
     }
 
     #[test]

@@ -187,7 +187,6 @@ struct LineWriter {
     path: PathBuf,
     file: File,
     pending: Vec<u8>,
-    /// Lines in `pending`.
     pending_lines: u64,
     /// Accepted lines that could not be written.
     lost: u64,

@@ -8,7 +8,6 @@ use std::path::{Path, PathBuf};
 use gleaner_base::Explain;
 use gleaner_base::safe_file::{self, UnsafePath};
 
-/// Name of the file that is locked.
 pub(crate) const LOCK: &str = ".lock";
 
 /// The lock on a folder of results, held until it is dropped.

@@ -11,7 +11,6 @@ use crate::queue::Queue;
 use crate::stamp::{self, StampMode};
 use crate::stderr::warn;
 
-/// A topic that is played.
 pub(crate) struct Outlet<'p> {
     /// Its ROS 2 name.
     pub(crate) topic: String,

@@ -1,7 +1,6 @@
 //! The quality of service that a topic is offered with: that of its writers when the drive was
 //! recorded.
 
-/// Offered quality of service.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Offer {
     pub(crate) reliable: bool,

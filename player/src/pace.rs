@@ -8,7 +8,6 @@ use rustix::time::{ClockId, Timespec};
 
 use crate::stamp::now;
 
-/// Playback speed.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub(crate) enum Rate {
     /// Multiple of the recorded speed.

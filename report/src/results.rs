@@ -107,7 +107,6 @@ impl<T> JsonLines<T> {
         }
     }
 
-    /// Reads the next line; `None` at the end of the file.
     fn next_line(&mut self) -> Option<Result<(), ResultsError>> {
         let reader = self.reader.as_mut()?;
         self.line += 1;

@@ -107,7 +107,6 @@ impl Explain for OutputError {
     }
 }
 
-/// `summary.json` of a run.
 #[derive(Debug)]
 pub(crate) enum RunSummary {
     Replay(Box<ReplaySummary>),
@@ -265,7 +264,6 @@ impl RunSummary {
         }
     }
 
-    /// Returns the sample counts of each input.
     pub(crate) fn topics(&self) -> Vec<TopicCounts> {
         match self {
             Self::Replay(summary) => summary.topics.iter().map(TopicCounts::from).collect(),

@@ -197,7 +197,6 @@ impl PeriodicSchedule {
         Some(Tick { at_ns: due_ns, missed: std::mem::take(&mut self.missed) })
     }
 
-    /// Returns the newest of the ticks that are due by now.
     fn newest_due(&mut self, due_ns: i64, now_ns: i64) -> Option<Tick> {
         if due_ns > now_ns {
             return None;

@@ -5,9 +5,7 @@ use std::fmt;
 
 use crate::text::visible;
 
-/// Longest name, in bytes.
 const NAME_BYTES: usize = 128;
-/// Maximum number of entries.
 const ENTRIES: usize = 1024;
 /// Charge for each entry besides its name and its bytes, about the overhead of the host.
 const ENTRY_BYTES: u64 = 64;

@@ -3,6 +3,7 @@
 pub mod bag;
 pub mod budgets;
 pub mod cloud;
+pub mod denied;
 pub mod drive;
 pub mod fake_messages;
 pub mod live;

@@ -54,14 +54,12 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     Ok(Exit::Ok)
 }
 
-/// A line for each trigger.
 fn rows(run: &TwinReplay) -> String {
     let lines =
         run.decisions.iter().flat_map(|decision| trigger_lines(decision, run.summary.start_ns));
     lines.map(|line| line + "\n").collect()
 }
 
-/// Writes and prints a file of the checkout.
 fn write(checkout: &Checkout, file: &Path, text: String) -> Result<(), Failure> {
     fs::write(checkout.path(file), &text).map_err(|error| cannot("write", file, &error))?;
     println!("{}:\n{text}", file.display());

@@ -49,7 +49,6 @@ impl Checkout {
         Checkout { target: root.join("target"), root, cargo, commit: None }
     }
 
-    /// Commits all files of a test; returns the commit.
     #[cfg(test)]
     pub(crate) fn commit_all(&self) -> String {
         self.git(&["init", "--quiet"]);
@@ -58,7 +57,6 @@ impl Checkout {
         self.git(&["rev-parse", "HEAD"])
     }
 
-    /// Runs git in a repository of a test; returns its output.
     #[cfg(test)]
     pub(crate) fn git(&self, arguments: &[&str]) -> String {
         let mut git = self.command("git");
@@ -91,7 +89,6 @@ impl Checkout {
         self.path(".venv/bin/python3")
     }
 
-    /// A program that cargo built.
     pub(crate) fn program(&self, name: &str) -> PathBuf {
         self.target.join("release").join(name)
     }

@@ -13,7 +13,6 @@ use crate::checkout::Checkout;
 use crate::onnxruntime::with_models;
 use crate::steps;
 
-/// The drive that comes with the checkout.
 pub(crate) const DRIVE: &str = "examples/data/highway_drive.mcap";
 
 const JOURNAL: &str = "wakes.journal";
@@ -54,7 +53,6 @@ pub(crate) struct TwinReplay {
     pub(crate) summary: ReplaySummary,
     /// Decisions with a trigger or a fault.
     pub(crate) decisions: Vec<Decision>,
-    /// Clips around its triggers.
     pub(crate) clips: Vec<Clip>,
     lambda: PathBuf,
     out: PathBuf,
@@ -183,7 +181,6 @@ impl TwinReplay {
     }
 }
 
-/// Runs `gleaner --json` and parses its report.
 fn report<T: serde::de::DeserializeOwned>(
     gleaner: &mut std::process::Command,
 ) -> Result<T, Failure> {

@@ -28,7 +28,6 @@ const TARGETS: [&str; 13] = [
 /// The target that runs a lambda. It needs that lambda compiled, and the host, which takes minutes
 /// to build.
 const CALLS: &str = "calls";
-/// The lambda of [`CALLS`].
 const DRIVER: &str = "tests/lambdas/driver/rust";
 /// The cache of its native code, shared with the tests.
 const CACHE: &str = "target/test-cache/gleaner";

@@ -25,7 +25,6 @@ pub(crate) struct Package {
 #[derive(Deserialize)]
 pub(crate) struct Dependency {
     pub(crate) name: String,
-    /// Folder of a package of the workspace.
     pub(crate) path: Option<String>,
 }
 

@@ -13,7 +13,6 @@ use crate::venv;
 
 /// Debian and Ubuntu packages of Cyclone DDS.
 const CYCLONE: [&str; 2] = ["cyclonedds-dev", "cyclonedds-tools"];
-/// Packages of Fast DDS.
 const FAST: [&str; 4] = ["libfastrtps-dev", "libfastcdr-dev", "fastddsgen", "default-jre-headless"];
 /// Packages for the private networks of tests.
 const NETWORK: [&str; 2] = ["iproute2", "nftables"];

@@ -25,7 +25,6 @@ struct HeavyPart {
     /// Packages whose programs it runs, beside the installed programs; with their dependencies in
     /// the workspace.
     packages: &'static [&'static str],
-    /// True if it starts installed programs.
     has_programs: bool,
     /// Further files and folders that it reads, relative to the checkout.
     files: &'static [&'static str],

@@ -20,14 +20,12 @@ const USAGE: &str =
 /// Runs of each revision. Rows with fewer than five values get no verdict.
 const ROUNDS: usize = 5;
 
-/// Benchmarks with results that can be compared.
 const BENCHMARKS: &str =
     "rtt, scale, isolation, cold-start, replay, record, drives, kernels, inference, fleet";
 
 /// Benchmarks that need gleaner-player, which is not built with the other programs.
 const LIVE: [&str; 3] = ["rtt", "scale", "isolation"];
 
-/// A revision, and where its runs are.
 struct Revision {
     /// As it was named.
     name: String,

@@ -13,7 +13,6 @@ use serde::de::DeserializeOwned;
 
 use crate::checkout::Checkout;
 
-/// Numbers the steps of a command.
 pub(crate) struct Steps {
     started: usize,
     total: usize,
@@ -70,12 +69,10 @@ pub(crate) fn write_file(file: &Path, text: &str) -> Result<(), Failure> {
     fs::write(file, text).map_err(|error| cannot("write", file, &error))
 }
 
-/// Creates a folder with those above it.
 pub(crate) fn make_folder(folder: &Path) -> Result<(), Failure> {
     fs::create_dir_all(folder).map_err(|error| cannot("create", folder, &error))
 }
 
-/// Removes a folder, if there is one.
 pub(crate) fn remove_folder(folder: &Path) -> Result<(), Failure> {
     match fs::remove_dir_all(folder) {
         Err(error) if error.kind() != io::ErrorKind::NotFound => {
@@ -143,7 +140,6 @@ pub(crate) fn output(command: &mut Command, help: &str) -> Result<String, Failur
     }
 }
 
-/// Parses the JSON that `source` has printed.
 pub(crate) fn parsed<T: DeserializeOwned>(json: &str, source: &str) -> Result<T, Failure> {
     serde_json::from_str(json).map_err(|error| {
         Failure::caused_by(Exit::Internal, format!("`{source}` gave no result"), &error)

@@ -78,7 +78,7 @@ impl ModelProcess {
             refused: None,
         };
         let (name, models) = ("bench".to_owned(), vec![granted]);
-        let client = AddClient { name, memory: 64 << 20, models };
+        let client = AddClient { name, memory: 64 << 20, models, ..AddClient::default() };
         self.control.add_client(&client, socket.as_fd()).expect("gleaner-inference reads");
         ModelClient::new(lambda_end)
     }

@@ -21,7 +21,6 @@ const PIN: &str = "is not NAME==VERSION, or has an unusual marker";
 const NO_HASH: &str = "has no hash";
 const HASH: &str = "is not --hash=sha256:HEX";
 
-/// Returns the requirements in `text`, a line each, in one form.
 pub(super) fn parse(text: &[u8]) -> Result<String, RefusedLine> {
     let text = String::from_utf8_lossy(text);
     let lines = text.strip_prefix('\u{feff}').unwrap_or(&text).split('\n');

@@ -85,7 +85,6 @@ impl Sandbox {
         &self.target
     }
 
-    /// Returns the command `cargo build` in the jail.
     pub(super) fn cargo(&self) -> Command {
         let mut command = Command::new(&self.shim);
         command.arg("--compiler").arg("--write").arg(&self.target);

@@ -140,11 +140,12 @@ fn policy(args: &PolicyArgs) -> Result<Exit, Failure> {
         ];
         let bounds: Vec<_> = bounds.into_iter().flatten().collect();
         let kept = if bounds.is_empty() { "without a bound".to_owned() } else { bounds.join(", ") };
-        let ClipUsage { stored, bytes, removed, removed_bytes } = &usage;
-        let [bytes, removed_bytes] = [*bytes, *removed_bytes].map(ByteSize::new);
+        let ClipUsage { stored, bytes, removed, removed_bytes, disk_bytes } = &usage;
+        let [bytes, removed_bytes, disk] = [*bytes, *removed_bytes, *disk_bytes].map(ByteSize::new);
         text += &format!(
             "the cloud keeps clips: {kept}\n\
-             in the cloud: {stored} clips, {bytes}; removed: {removed} clips, {removed_bytes}\n"
+             in the cloud: {stored} clips, {bytes}; removed: {removed} clips, {removed_bytes}\n\
+             on its disk, with thumbnails, entries and unfinished files: {disk}\n"
         );
         text
     })

@@ -89,7 +89,6 @@ pub(super) fn since(before: Duration) -> String {
     nanoseconds(since_1970().saturating_sub(before)).to_string()
 }
 
-/// Escapes a value of a query.
 fn escaped(text: &str) -> String {
     let escape = |byte: u8| match byte {
         b'a'..=b'z' | b'A'..=b'Z' | b'0'..=b'9' | b'-' | b'.' | b'_' => char::from(byte).into(),

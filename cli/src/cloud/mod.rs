@@ -50,7 +50,6 @@ pub(crate) fn run(command: &CloudCommand) -> Result<Exit, Failure> {
     }
 }
 
-/// Returns a client of the cloud that the user has logged in to.
 fn client() -> Result<VehicleClient, Failure> {
     VehicleClient::of_cloud(CloudAccount::load()?)
 }
@@ -60,7 +59,6 @@ fn date(seconds: u64) -> String {
     gleaner_base::UtcTime::of(seconds.try_into().unwrap_or(i64::MAX)).to_string()
 }
 
-/// Returns a vehicle that has reported nothing.
 #[cfg(test)]
 fn test_vehicle(
     name: &str,

@@ -46,7 +46,6 @@ pub(super) fn vehicles(args: &VehiclesArgs) -> Result<Exit, Failure> {
     }
 }
 
-/// Enrols a vehicle, and writes the file for it.
 fn enrol(args: &NewVehicleArgs, json: bool) -> Result<Exit, Failure> {
     let (name, file) = (args.name.to_string(), args.to.display().to_string());
     // Before the request: its secret is not sent again.
@@ -74,7 +73,6 @@ fn enrol(args: &NewVehicleArgs, json: bool) -> Result<Exit, Failure> {
     })
 }
 
-/// Returns the keys of vehicles that have connected.
 fn keys(vehicles: &[VehicleSummary]) -> Vec<(VehicleName, PublicKey)> {
     let key = |it: &VehicleSummary| Some((it.name.parse().ok()?, it.key.parse().ok()?));
     vehicles.iter().filter_map(key).collect()

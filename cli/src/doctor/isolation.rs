@@ -1,7 +1,7 @@
 //! Checks the isolation layers of a lambda's process: `gleaner-shim` sets each one up and tests it.
 
 use gleaner_parts::Parts;
-use gleaner_protocol::{Holds, Layer};
+use gleaner_protocol::{Holds, Layer, REQUIRED_HELP};
 
 use super::{Finding, Severity, output_of};
 
@@ -31,6 +31,12 @@ fn finding(layer: &Layer) -> Finding {
     let detail = format!("{}: {}", layer.name, layer.note);
     match layer.holds {
         Holds::Yes => Finding::ok("isolation", detail),
+        Holds::No if layer.prevents_lambdas() => Finding {
+            subject: "isolation",
+            state: Severity::Error,
+            detail: format!("no lambda can run: {detail}"),
+            help: Some(REQUIRED_HELP.to_owned()),
+        },
         Holds::Partly | Holds::No => Finding {
             subject: "isolation",
             state: Severity::Warning,

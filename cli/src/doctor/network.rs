@@ -2,11 +2,13 @@
 
 use std::fs;
 use std::net::Ipv4Addr;
+use std::os::fd::AsRawFd;
 
 use gleaner_base::{Exit, ignored_variables};
 use gleaner_parts::Parts;
 use nix::ifaddrs::getifaddrs;
 use nix::net::if_::InterfaceFlags;
+use rustix::process::{PidfdFlags, PidfdGetfdFlags, getpid, pidfd_getfd, pidfd_open};
 
 use super::{Finding, output_of};
 
@@ -36,7 +38,7 @@ pub(super) fn findings(parts: &Parts) -> Vec<Finding> {
             .is_ok_and(|range| range.eq_ignore_ascii_case("localhost"));
     vec![
         socket_buffer(buffer.ok().and_then(|text| text.trim().parse().ok())),
-        socket_filter(filters.ok().and_then(|text| text.trim().parse().ok())),
+        socket_filter(filters.ok().and_then(|text| text.trim().parse().ok()), own_handle()),
         real_time(parts),
         discovery(&interfaces(), &routes, localhost_only),
         domain(std::env::var("ROS_DOMAIN_ID").ok().as_deref()),
@@ -66,8 +68,22 @@ fn socket_buffer(max: Option<u64>) -> Finding {
     }
 }
 
-fn socket_filter(max: Option<u64>) -> Finding {
+/// Duplicates a descriptor of this process, as the ingress does to set the filter.
+fn own_handle() -> rustix::io::Result<()> {
+    let this = pidfd_open(getpid(), PidfdFlags::empty())?;
+    pidfd_getfd(&this, this.as_raw_fd(), PidfdGetfdFlags::empty()).map(drop)
+}
+
+fn socket_filter(max: Option<u64>, handle: rustix::io::Result<()>) -> Finding {
     const SUBJECT: &str = "socket filter";
+    if let Err(error) = handle {
+        let found = format!(
+            "the system refuses `pidfd_open` or `pidfd_getfd` ({error}): there is no filter \
+             against fragment floods"
+        );
+        let help = "let the container permit both (Linux 5.6 has them), as with CAP_SYS_PTRACE";
+        return Finding::warning(SUBJECT, found, help);
+    }
     let help =
         format!("`sysctl -w net.core.optmem_max={FILTER_BYTES}`, and the same in /etc/sysctl.d");
     match max {

@@ -20,7 +20,6 @@ use crate::remove_folder;
 /// Embedded files by their path in the repository.
 const PACKED: &[(&str, &[u8])] = include!(concat!(env!("OUT_DIR"), "/packed.rs"));
 
-/// Folder of the SDK.
 const SDK: &str = ".gleaner";
 /// Replacements for the `Cargo.toml` files of the repository in the SDK.
 const PACKAGES: [(&str, &str); 2] = [
@@ -188,7 +187,6 @@ fn unpack_sdk(to: &Path, kind: LambdaKind) -> Result<(), NewError> {
     copy("LICENSE", to)
 }
 
-/// Writes the embedded `file` into the folder `to`.
 fn copy(file: &str, to: &Path) -> Result<(), NewError> {
     PACKED
         .iter()

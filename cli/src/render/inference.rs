@@ -15,10 +15,10 @@ pub(crate) fn inference_event(event: &InferenceEvent, paint: Paint) -> String {
     match event {
         InferenceEvent::Report(report) => inference(report, paint),
         InferenceEvent::Stderr(text) => String::from_utf8_lossy(text).into_owned(),
-        InferenceEvent::Ended(reason, delay) => {
+        InferenceEvent::Ended(reason, delay, _) => {
             warning(&format!("{reason}; restarting in {} s", delay.as_secs_f64()))
         }
-        InferenceEvent::Warning(text) => warning(text),
+        InferenceEvent::Refused(text) | InferenceEvent::Warning(text) => warning(text),
     }
 }
 
@@ -28,7 +28,7 @@ pub(crate) fn inference(report: &InferenceReport, paint: Paint) -> String {
     written(|text| match report {
         InferenceReport::Model(model) => write_model(text, model, paint),
         InferenceReport::Ended(status) => write_status(text, status, paint),
-        InferenceReport::Ready | InferenceReport::Status(_) => Ok(()),
+        InferenceReport::Ready | InferenceReport::Try(_) | InferenceReport::Status(_) => Ok(()),
     })
 }
 

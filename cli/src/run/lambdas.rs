@@ -131,7 +131,6 @@ mod tests {
     use super::*;
     use crate::args;
 
-    /// Returns a lambda that reads and records `topic`.
     fn lambda(name: &str, topic: &str) -> LambdaSpec {
         let text = format!(
             "lambda = {{ name = '{name}', version = '0.1.0', kind = 'python', entry = 'x.py' }}\n\

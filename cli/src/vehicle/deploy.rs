@@ -399,7 +399,8 @@ fn wait(
             let seconds = format_duration(timeout);
             let message = format!("deployment `{id}` does not run after {seconds}");
             let phase = lambda.map(|it| format!("it is {}", it.phase.as_str()));
-            let causes = phase.into_iter().collect();
+            let end = lambda.and_then(|it| it.last_end.as_deref()).map(in_one_line);
+            let causes = phase.into_iter().chain(end).collect();
             return Err(Failure { causes, ..Failure::new(Exit::Differs, message) }
                 .with_help("it goes on: `gleaner status` and `gleaner events` show it"));
         }

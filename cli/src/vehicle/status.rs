@@ -4,14 +4,17 @@ use std::collections::BTreeMap;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use gleaner_base::{Exit, Failure, UtcTime, format_duration, in_one_line, visible};
+use gleaner_base::{ByteSize, Exit, Failure, UtcTime, format_duration, in_one_line, visible};
 use gleaner_protocol::LossOutcome;
 use gleaner_protocol::link::RecorderStatus;
 use gleaner_protocol::supervision::{LambdaPhase, LambdaStatus, ProcessStatus};
-use gleaner_protocol::vehicle_api::{Capacity, CloudStatus, DeploymentStatus, VehicleStatus};
+use gleaner_protocol::vehicle_api::{
+    Capacity, ClipsStatus, CloudStatus, DeploymentStatus, FailingStreams, StreamLoss, VehicleStatus,
+};
 use gleaner_report::format::{counted, grouped, size};
 
 use super::client::VehicleClient;
+use super::stream::gap_reason;
 use crate::args::StatusArgs;
 use crate::output::show;
 use crate::render::{Paint, or_dash, table};
@@ -64,6 +67,9 @@ pub(super) fn text(status: &VehicleStatus, paint: Paint) -> String {
             text += &service("recorder", supervisor.recorder.as_ref(), paint);
             text += &losses(supervisor.recorder.as_ref(), paint);
             text += &service("inference", supervisor.inference.as_ref(), paint);
+            for refused in &supervisor.refused_models {
+                text += &format!("  {}\n", paint.red(&visible(refused)));
+            }
         }
     }
     let supervisor = status.supervisor.as_ref().map_or(0, |supervisor| supervisor.events_lost);
@@ -73,6 +79,9 @@ pub(super) fn text(status: &VehicleStatus, paint: Paint) -> String {
             let line = format!("events of the {program} lost: {lost}; check the disk and its room");
             text += &format!("  {}\n", paint.red(&line));
         }
+    }
+    for lost in &status.records_lost {
+        text += &format!("  {}\n", paint.red(&records_lost(lost)));
     }
     if status.deployments.is_empty() {
         return text + &format!("\n{NO_DEPLOYMENTS}\n");
@@ -118,15 +127,73 @@ pub(crate) fn cloud_line(status: Option<&CloudStatus>, paint: Paint) -> String {
     };
     let reason = status.reason.iter().map(|reason| format!(": {}", in_one_line(reason)));
     let help = status.help.iter().map(|help| format!(". {}", in_one_line(help)));
-    let since = Duration::from_secs(status.since_s.max(0.0) as u64);
+    let uncounted = match status.uncounted {
+        0 => String::new(),
+        count => format!(", and those of {} not counted", counted(count, "stream")),
+    };
     format!(
-        "  cloud {} {state} for {}{}; {} not sent, certificate until {}\n",
+        "  cloud {} {state} for {}{}; {} not sent{uncounted}, certificate until {}\n{}{}",
         visible(&status.address),
-        format_duration(since),
+        seconds(status.since_s),
         reason.chain(help).collect::<String>(),
         counted(status.unsent, "record"),
         UtcTime::of(status.certificate_expires.try_into().unwrap_or(i64::MAX)),
+        failing_lines(&status.failing, paint),
+        clips_line(&status.clips, paint),
     )
+}
+
+fn seconds(time: f64) -> String {
+    format_duration(Duration::from_secs(time.max(0.0) as u64))
+}
+
+/// Returns a line for each cause of streams that cannot be sent.
+fn failing_lines(failing: &[FailingStreams], paint: Paint) -> String {
+    let line = |it: &FailingStreams| {
+        let (streams, since, tried) =
+            (counted(it.streams, "stream"), seconds(it.since_s), seconds(it.tried_s));
+        let example = in_one_line(&it.example);
+        let line = format!("{streams} not sent for {since}, tried {tried} ago: {example}");
+        format!("    {}\n", paint.yellow(&line))
+    };
+    failing.iter().map(line).collect()
+}
+
+/// Returns the line of records that could not be written to a spool.
+fn records_lost(lost: &StreamLoss) -> String {
+    let name = lost.stream.strip_prefix("lambdas/").unwrap_or(&lost.stream);
+    let help = match &*lost.reason {
+        "DiskFull" | "WriteFailed" => "; check the disk and its room",
+        _ => "",
+    };
+    format!(
+        "records of `{}` lost: {}, the last one at {}: {}{help}",
+        visible(name),
+        grouped(lost.records),
+        UtcTime::of(lost.last_ns.div_euclid(1_000_000_000)),
+        gap_reason(&lost.reason),
+    )
+}
+
+/// Returns the line of clips on their way to the cloud, if there are any.
+fn clips_line(clips: &ClipsStatus, paint: Paint) -> String {
+    let counts = [
+        (clips.waiting.unwrap_or(0), "on their way to the cloud"),
+        (clips.unreadable, "cannot be read"),
+    ];
+    let counts = counts.iter().filter(|(count, _)| *count > 0);
+    let mut parts: Vec<_> = counts.map(|(count, what)| format!("{count} {what}")).collect();
+    let unannounced = clips.unannounced_bytes.filter(|bytes| *bytes > 0).map(ByteSize::new);
+    parts.extend(unannounced.map(|bytes| format!("{bytes} of their list not announced")));
+    parts.extend(clips.paused.as_deref().map(in_one_line));
+    parts.extend(clips.stuck.as_ref().map(|stuck| {
+        let name = stuck.name.as_deref().map_or("the list".to_owned(), visible);
+        let since = format_duration(Duration::from_secs(stuck.since_s.max(0.0) as u64));
+        let (attempts, cause) = (stuck.attempts, in_one_line(&stuck.cause));
+        let line = format!("no progress of {name} in {attempts} attempts for {since}: {cause}");
+        paint.yellow(&line)
+    }));
+    if parts.is_empty() { String::new() } else { format!("  clips: {}\n", parts.join("; ")) }
 }
 
 /// Formats a resource that lambdas share: `memory 1.2 MiB of 8.0 MiB asked for, 0.9 MiB used`.
@@ -182,12 +249,16 @@ pub(super) fn reasons(deployment: &DeploymentStatus) -> Vec<String> {
         let asked = amount(demand.asked, &demand.unit);
         format!("{} {asked} ({})", demand.resource, demand.source)
     });
+    let live = deployment.status.as_ref().and_then(|lambda| lambda.live.as_deref());
+    let unwritten = live.map_or(0, |live| live.unwritten);
+    let unwritten = (unwritten > 0).then(|| counted(unwritten, "decision or log line"));
     let all = [
         ("refused", deployment.refused.as_ref()),
         ("runs its fallback", deployment.failed.as_ref()),
         ("should be signed again", deployment.stale.as_ref()),
         ("uses more than it states", exceeds.as_ref()),
         ("last end", last_end),
+        ("not written since its start", unwritten.as_ref()),
     ];
     let line =
         |(what, why): (&str, Option<&String>)| Some(format!("{what}: {}", in_one_line(why?)));

@@ -2,7 +2,7 @@
 
 use gleaner_base::text::list;
 use gleaner_base::{Exit, Failure, UtcTime, in_one_line, visible};
-use gleaner_protocol::vehicle_api::StreamLine;
+use gleaner_protocol::vehicle_api::{StreamLine, in_order};
 use serde_json::Value;
 
 use super::client::VehicleClient;
@@ -61,38 +61,18 @@ fn is_empty(client: &VehicleClient, path: &str) -> Result<bool, Failure> {
 /// Records that are printed in order.
 #[derive(Default)]
 struct ListedRecords {
-    /// Identities of starts of the machine, in the order in which their first records came.
-    boots: Vec<String>,
-    /// Each with the index of its start, and the time since it.
-    lines: Vec<((usize, u64), StreamLine)>,
+    lines: Vec<StreamLine>,
     bytes: usize,
 }
 
 impl ListedRecords {
-    fn add(&mut self, line: StreamLine, bytes: usize) {
-        // The time of day may have been set meanwhile. A gap has no time: it stays where it is.
-        let before = self.lines.last().map(|(place, _)| *place).unwrap_or_default();
-        let known = self.boots.iter().position(|boot| *boot == line.boot);
-        let place = match (line.boot.is_empty(), known) {
-            (true, _) => before,
-            (false, Some(boot)) => (boot, line.boot_ns),
-            (false, None) => {
-                self.boots.push(line.boot.clone());
-                (self.boots.len() - 1, line.boot_ns)
-            }
-        };
-        self.lines.push((place, line));
-        self.bytes += bytes;
-    }
-
     fn print(&mut self, paint: Paint) -> Result<(), Failure> {
-        self.lines.sort_by_key(|(place, _)| *place);
-        self.bytes = 0;
-        self.lines.drain(..).try_for_each(|(_, line)| print(&record_text(&line, paint)))
+        let lines = in_order(std::mem::take(self).lines, |line| line.into());
+        lines.iter().try_for_each(|line| print(&record_text(line, paint)))
     }
 }
 
-/// Prints records; returns their number. A list is sorted by starts of the machine and the time
+/// Prints records; returns their number. A list is sorted by boots of the machine and the time
 /// since each; records that are followed, and JSON for programs, come as they arrived.
 fn show(client: &VehicleClient, path: &str, args: &StreamArgs) -> Result<u64, Failure> {
     let path = format!("{path}?last={}&follow={}", args.last, args.follow);
@@ -113,7 +93,8 @@ fn show(client: &VehicleClient, path: &str, args: &StreamArgs) -> Result<u64, Fa
         if args.follow {
             return print(&record_text(&line, paint));
         }
-        listed.add(line, text.len());
+        listed.bytes += text.len();
+        listed.lines.push(line);
         if listed.bytes > SORTED_MAX { listed.print(paint) } else { Ok(()) }
     });
     listed.print(paint)?;
@@ -179,7 +160,13 @@ fn decision_words(record: &Value) -> String {
 /// Returns the numbers of records that are missing from `first` on, and the reason.
 fn gap_words(first: u64, record: &Value) -> String {
     let last = record.get("to").and_then(Value::as_u64).unwrap_or(first);
-    let reason = match record.get("reason").and_then(Value::as_str).unwrap_or_default() {
+    let reason = gap_reason(record.get("reason").and_then(Value::as_str).unwrap_or_default());
+    format!("records {first} to {last} are missing: {reason}")
+}
+
+/// Returns the reason of a gap in words.
+pub(super) fn gap_reason(reason: &str) -> &'static str {
+    match reason {
         "Budget" | "Retention" => "newer ones took their room",
         "DiskFull" => "the disk was full",
         "WriteFailed" => "writing to the disk failed",
@@ -187,8 +174,7 @@ fn gap_words(first: u64, record: &Value) -> String {
         "Torn" => "a kill or a power cut, and some were never used",
         "Damaged" => "their bytes were changed",
         _ => "no file has them",
-    };
-    format!("records {first} to {last} are missing: {reason}")
+    }
 }
 
 /// Formats a time in the form of RFC 3339, in UTC, with ms.

@@ -13,20 +13,17 @@ use serde_json::Value;
 /// test is about to start. The lock serialises writing and starting programs.
 static EXEC_LOCK: Mutex<()> = Mutex::new(());
 
-/// Writes a script that can be started.
 pub fn script(path: &Path, text: &str) {
     let _lock = EXEC_LOCK.lock().unwrap_or_else(PoisonError::into_inner);
     fs::write(path, text).unwrap();
     fs::set_permissions(path, fs::Permissions::from_mode(0o755)).unwrap();
 }
 
-/// Starts a program.
 pub fn start(command: &mut Command) -> Child {
     let _lock = EXEC_LOCK.lock().unwrap_or_else(PoisonError::into_inner);
     command.spawn().unwrap()
 }
 
-/// Runs a program, and returns its output.
 pub fn output(command: &mut Command) -> Output {
     start(command.stdout(Stdio::piped()).stderr(Stdio::piped())).wait_with_output().unwrap()
 }
@@ -39,7 +36,6 @@ pub fn done(command: &mut Command) -> String {
     String::from_utf8(stdout).unwrap()
 }
 
-/// The program `gleaner`, started in a folder.
 pub fn gleaner(folder: &Path, arguments: &[&str]) -> Command {
     let mut gleaner = Command::new(env!("CARGO_BIN_EXE_gleaner"));
     gleaner.current_dir(folder).args(arguments).stdin(Stdio::null());

@@ -275,10 +275,3 @@ fn a_failing_standard_output_is_an_error() {
         );
     }
 }
-
-#[test]
-fn a_value_without_an_equals_sign_is_refused_before_anything_starts() {
-    let output = Installation::new("touch started").replay(&["--set", "brake_mps2"]);
-    assert_eq!(output.status.code(), Some(2));
-    assert!(text(&output.stderr).contains("write KEY=VALUE"));
-}

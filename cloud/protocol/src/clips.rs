@@ -1,8 +1,10 @@
 //! Messages about clips: what a vehicle announces, what the cloud wants of it, and what people see.
 //!
 //! A vehicle sends a [`ClipReport`] to `POST /v1/clips` and gets [`ClipOrders`], the complete list
-//! of what the cloud still wants, best first. It sends files in parts of [`CLIP_PART`] bytes to
-//! `PUT /v1/clips/NAME/parts/NUMBER/SHA256`, and images to `PUT /v1/clips/NAME/thumbnail`.
+//! of what the cloud still wants, best first. It sends files in pieces to
+//! `PUT /v1/clips/NAME/from/BYTE`, and images to `PUT /v1/clips/NAME/thumbnail`. Of a piece that
+//! breaks off, the cloud keeps what has come. Older vehicles send parts of [`CLIP_PART`] bytes to
+//! `PUT /v1/clips/NAME/parts/NUMBER/SHA256`.
 
 use std::fmt;
 use std::str::FromStr;
@@ -10,8 +12,10 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-/// Length of each part of a file but the last one.
+/// Length of each part of a file but the last one, and of the longest piece.
 pub const CLIP_PART: u64 = 8 << 20;
+/// Shortest piece that the cloud keeps, unless the file ends with it.
+pub const CLIP_PIECE_MIN: u64 = 4 << 10;
 /// Longest clip: no recorder writes a longer one at once.
 pub const CLIP_MAX: u64 = 64 << 30;
 /// Longest thumbnail.
@@ -171,6 +175,9 @@ pub struct ClipFacts {
     /// True if the recorder died, and a later one recovered the clip.
     #[serde(default)]
     pub is_recovered: bool,
+    /// The reason why the vehicle cannot read the file now; it has no `sha256` until it can.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub unreadable: Option<String>,
 }
 
 /// A lambda of a clip.
@@ -240,7 +247,11 @@ impl ClipFacts {
             {
                 "it has too many entries"
             }
-            () if lambda_texts.chain(moment_texts).any(|text| text.len() > TEXT_MAX) => {
+            () if lambda_texts
+                .chain(moment_texts)
+                .chain(&self.unreadable)
+                .any(|text| text.len() > TEXT_MAX) =>
+            {
                 "a text is too long"
             }
             () if moments.iter().any(|it| it.score.is_some_and(|score| !score.is_finite())) => {
@@ -252,9 +263,8 @@ impl ClipFacts {
         Err(format!("clip `{name}`: {reason}"))
     }
 
-    /// Returns the length of the part with this number; `None` if there is none.
-    pub fn part_length(bytes: u64, part: u64) -> Option<u64> {
-        let begin = part.checked_mul(CLIP_PART)?;
+    /// Returns the length of the longest piece that begins at a byte; `None` beyond the end.
+    pub fn piece_length(bytes: u64, begin: u64) -> Option<u64> {
         bytes.checked_sub(begin).filter(|rest| *rest > 0).map(|rest| rest.min(CLIP_PART))
     }
 
@@ -267,7 +277,7 @@ impl ClipFacts {
         self.lambdas.truncate(ENTRIES_MAX);
         self.moments.truncate(ENTRIES_MAX);
         self.incomplete.truncate(16);
-        self.incomplete.iter_mut().for_each(cut);
+        self.incomplete.iter_mut().chain(&mut self.unreadable).for_each(cut);
         for lambda in &mut self.lambdas {
             [&mut lambda.name, &mut lambda.version, &mut lambda.digest].into_iter().for_each(cut);
         }
@@ -315,6 +325,21 @@ pub struct ClipOrders {
     pub thumbnails: Vec<ClipName>,
     /// Clips whose files it lacks, the most important first.
     pub wanted: Vec<WantedClip>,
+    /// Bytes that the vehicle may send. An older cloud states none.
+    #[serde(default)]
+    pub budget: Option<ClipBudget>,
+}
+
+/// Bytes of clips that a vehicle may send in a day, those that do not arrive too.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ClipBudget {
+    /// Number of the day, by the clock of the cloud: with another one, the count begins again.
+    pub day: u64,
+    /// Number of bytes in that day.
+    pub bytes: u64,
+    /// True if as many have arrived: then nothing is wanted.
+    #[serde(default)]
+    pub is_spent: bool,
 }
 
 /// A clip whose file the cloud wants.
@@ -328,6 +353,9 @@ pub struct WantedClip {
     pub sha256: String,
     /// Number of the next part.
     pub part: u64,
+    /// Number of bytes that the cloud has; an older one states none, and takes whole parts only.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub from: Option<u64>,
 }
 
 /// A clip of the fleet.
@@ -366,7 +394,7 @@ pub enum ClipState {
     Stored,
     /// Nowhere: the vehicle has deleted it.
     Gone,
-    /// On its vehicle, but not as announced: it is not wanted any more.
+    /// On its vehicle, but not as announced, or the vehicle cannot read it.
     Failed,
 }
 
@@ -391,12 +419,14 @@ impl ClipState {
 pub struct ClipPolicy {
     /// The clips that are uploaded.
     pub upload: UploadedClips,
-    /// Number of bytes that each vehicle uploads in a day of UTC.
+    /// Number of bytes that each vehicle sends in a day of UTC: of files and thumbnails, and of
+    /// requests that did not arrive in full; each counts as 4 KiB at least.
     pub day_bytes: u64,
     /// Time after which a stored clip is removed, in s; 0 without a bound.
     #[serde(default)]
     pub keep_s: u64,
-    /// Number of bytes of stored clips above which the oldest are removed; 0 without a bound.
+    /// Number of bytes of stored clips, with thumbnails and entries, above which the oldest are
+    /// removed; 0 without a bound.
     #[serde(default)]
     pub keep_bytes: u64,
 }
@@ -413,6 +443,10 @@ pub struct ClipUsage {
     pub removed: u64,
     /// Bytes of their files.
     pub removed_bytes: u64,
+    /// Bytes that all clips have on the disk: files, thumbnails, entries, uploads that are
+    /// unfinished, and files that are not removed yet.
+    #[serde(default)]
+    pub disk_bytes: u64,
 }
 
 /// The clips that vehicles upload.

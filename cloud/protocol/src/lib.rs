@@ -4,7 +4,8 @@
 //! `enrolment` has the messages by which a vehicle gets its certificate, and `people` those of the
 //! API for people; `waves` is the part of it by which a release reaches vehicles step by step.
 //! `clips` has those about recorded clips, and `records` those of a search. `object` checks files
-//! that are sent. Nothing here opens a connection.
+//! that are sent. Nothing here opens a connection; with the feature of that name, `entrance`
+//! accepts those of clients.
 //!
 //! A vehicle is given the complete wanted state, never a change of it: a list of deployments, each
 //! by the digest of its signed envelope. It fetches envelopes and files that it lacks by HTTPS from
@@ -13,6 +14,8 @@
 
 pub mod clips;
 mod enrolment;
+#[cfg(feature = "entrance")]
+pub mod entrance;
 mod frame;
 mod object;
 pub mod people;

@@ -38,8 +38,7 @@ pub struct WantedProblem {
 impl WantedProblem {
     /// Returns the action and its causes in one line, safe to print.
     pub fn in_words(&self) -> String {
-        let parts = std::iter::once(&self.title).chain(&self.causes);
-        parts.map(|part| gleaner_base::visible(part)).collect::<Vec<_>>().join(": ")
+        gleaner_base::text::in_words(&self.title, &self.causes)
     }
 
     /// Returns the deployment, the action, its causes and the help in one line, safe to print.

@@ -6,41 +6,43 @@ use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
 use gleaner_base::RateLimit;
+use gleaner_fleet::entrance::ClientNetwork;
 
-use crate::clients::ClientNetwork;
 use crate::error::{CloudError, CloudResult};
 
-/// Maximum number of keys that are remembered. With this many at once, further ones share a limit.
+/// Maximum number of keys that are remembered. With this many at once, those that have most left
+/// are forgotten: strangers choose keys, and must not fill the table for others.
 const KEYS_MAX: usize = 20_000;
+const KEYS_FORGOTTEN: usize = KEYS_MAX / 4;
 
 #[derive(Debug)]
 struct LimitOfEach<K> {
     limit: RateLimit,
-    /// Content of a full limit: its key needs not be remembered.
-    burst: f64,
-    limits: Mutex<HashMap<Option<K>, RateLimit>>,
+    limits: Mutex<HashMap<K, RateLimit>>,
 }
 
 impl<K: Hash + Eq> LimitOfEach<K> {
     fn new(per_s: f64, burst: f64) -> Self {
-        Self { limit: RateLimit::of(per_s, burst), burst, limits: Mutex::default() }
+        Self { limit: RateLimit::of(per_s, burst), limits: Mutex::default() }
     }
 
     /// Counts an attempt; above the limit, it is an error with this message and help.
     fn count(&self, key: K, message: impl FnOnce() -> String, help: &str) -> CloudResult<()> {
-        let now = Instant::now();
-        let mut limits = self.limits.lock().unwrap_or_else(PoisonError::into_inner);
-        if limits.len() >= KEYS_MAX {
-            limits.retain(|_, limit| {
-                let mut limit = *limit;
-                !limit.take(self.burst, now)
-            });
-        }
-        let key = (limits.len() < KEYS_MAX).then_some(key);
-        match limits.entry(key).or_insert(self.limit).take(1.0, now) {
+        match self.take(key, Instant::now()) {
             true => Ok(()),
             false => Err(CloudError::busy(message(), help)),
         }
+    }
+
+    fn take(&self, key: K, now: Instant) -> bool {
+        let mut limits = self.limits.lock().unwrap_or_else(PoisonError::into_inner);
+        if limits.len() >= KEYS_MAX && !limits.contains_key(&key) {
+            let mut left: Vec<_> = limits.values().map(|limit| limit.left(now)).collect();
+            let at = left.len() - KEYS_FORGOTTEN;
+            let least = *left.select_nth_unstable_by(at, f64::total_cmp).1;
+            limits.retain(|_, limit| limit.left(now) < least);
+        }
+        limits.entry(key).or_insert(self.limit).take(1.0, now)
     }
 }
 
@@ -68,8 +70,8 @@ impl WrongSecrets {
         self.networks.count(network, message, "wait a minute, and use the newest code or token")
     }
 
-    /// Counts a password before it is checked: unlike codes and tokens, passwords can be guessed,
-    /// so that right ones are refused, too.
+    /// Counts a password for a name before it is checked: unlike codes and tokens, passwords can be
+    /// guessed, so that right ones are refused, too.
     pub(crate) fn count_password(&self, network: ClientNetwork, name: &str) -> CloudResult<()> {
         let message = || "too many passwords were tried for this name from your address".to_owned();
         let help = "wait a minute, or log in by a code that an administrator gives you";
@@ -143,9 +145,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn wrong_secrets_of_one_network_do_not_stop_another() {
+    fn wrong_secrets_of_one_network_do_not_stop_another_also_behind_a_proxy() {
         let wrong = WrongSecrets::default();
-        let network = |text: &str| ClientNetwork::of(text.parse().unwrap());
+        let network = |address: &str| {
+            let mut headers = axum::http::HeaderMap::new();
+            headers.insert("x-forwarded-for", address.parse().unwrap());
+            ClientNetwork::LOCAL.behind_proxy(&headers)
+        };
         let (one, other) = (network("2001:db8::1"), network("2001:db8:1::1"));
         for last in 0..10 {
             let one = network(&format!("2001:db8::{last}"));
@@ -156,7 +162,22 @@ mod tests {
         assert!(wrong.count_password(one, "ann").is_err());
         assert!(wrong.count(other).is_ok());
         assert!(wrong.count_password(one, "bea").is_ok());
+        // Nor does it with ever new names, which fill the table again and again.
+        for name in 0..2 * KEYS_MAX {
+            assert!(wrong.count_password(one, &name.to_string()).is_ok());
+        }
         assert!(wrong.count_password(other, "ann").is_ok());
+    }
+
+    #[test]
+    fn a_full_table_refuses_neither_known_nor_new_keys_and_keeps_the_guilty_ones() {
+        let (limits, now) = (LimitOfEach::new(1.0, 10.0), Instant::now());
+        let take = |address: &str| limits.take(address.to_owned(), now);
+        assert!((0..10).all(|_| take("guilty")) && !take("guilty"));
+        assert!(take("known"));
+        assert!((0..2 * KEYS_MAX).all(|stranger| take(&stranger.to_string())));
+        assert!(limits.limits.lock().unwrap().len() <= KEYS_MAX);
+        assert!(take("known") && take("new") && !take("guilty"));
     }
 
     #[test]

@@ -1,11 +1,11 @@
 //! The cloud of a fleet: vehicles connect to it, and people deploy by it.
 //!
 //! `store` is the database and `objects` has the files, in a `place`: a folder, or a bucket (`s3`).
-//! Together with the certificates of `authority` they are all that survives a restart. `accept`
-//! accepts connections for both listeners, within the bounds of `clients`: `people` and `page`
-//! answer requests of people, and `vehicles` those of vehicles, each of which keeps one connection
-//! open. `hub` has these connections, and wakes them after a change; by `tails`, vehicles learn
-//! which of their records people follow.
+//! Together with the certificates of `authority` they are all that survives a restart. `people` and
+//! `page` answer requests of people, and `vehicles` those of vehicles, each of which keeps one
+//! connection open; the entrance of `gleaner-fleet` accepts the connections of both. `hub` has
+//! those of vehicles, and wakes them after a change; by `tails`, vehicles learn which of their
+//! records people follow.
 //! `clips` has recorded clips of vehicles, and `records` old records in files, each with a place of
 //! its own. `transfer` receives files and sends them.
 //!
@@ -16,12 +16,9 @@
 //! Nothing here runs a lambda, or decides what a vehicle runs: each vehicle verifies signatures by
 //! its own trust root. `counts` has the numbers that `/metrics` shows.
 
-mod accept;
 mod attempts;
 mod authority;
-mod bounds;
 mod bus;
-mod clients;
 mod clips;
 mod cloud;
 mod counts;

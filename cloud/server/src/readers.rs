@@ -4,11 +4,11 @@ use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
+use gleaner_fleet::entrance::BoundCounts;
 use gleaner_fleet::people::{Role, User};
 use tokio::sync::watch;
 use tokio::time::{Instant, sleep_until};
 
-use crate::bounds::BoundCounts;
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 

@@ -5,18 +5,22 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
+use axum::middleware::map_response;
+use axum::response::Response;
+use axum::serve::{Listener, ListenerExt};
 use gleaner_base::{Exit, Failure};
+use gleaner_fleet::entrance::Entrance;
 use rustls::ServerConfig;
 use tokio::net::TcpListener;
 use tokio::sync::{Semaphore, watch};
 use tokio::task::JoinSet;
 
-use crate::accept::Entrance;
 use crate::attempts::{AccountChanges, VehicleLimits, WrongSecrets};
 use crate::authority::Authorities;
 use crate::bus::{Bus, BusAddress};
 use crate::clips::ClipFiles;
 use crate::cloud::{Cloud, STORED_FRAMES_MAX};
+use crate::counts::COUNTS;
 use crate::folder::{DataFolder, FolderLock};
 use crate::hub::Hub;
 use crate::objects::Objects;
@@ -29,11 +33,12 @@ use crate::ticks::ticks;
 use crate::{clips, objects, people, records, replicas, tails, vehicles};
 
 /// Maximum number of open connections of people, and of vehicles: a whole fleet has another one
-/// for the files of a deployment.
-const PEOPLE_MAX: u32 = 1000;
-const VEHICLES_MAX: u32 = 40_000;
-/// Maximum number of those of people in one network: a browser has six.
-const PEOPLE_OF_ONE_MAX: u32 = 200;
+/// for the files of a deployment. With few descriptors, there are fewer.
+const PEOPLE_MAX: usize = 1000;
+const VEHICLES_MAX: usize = 40_000;
+/// Maximum number of connections that have not shown a vehicle's certificate yet. A vehicle needs
+/// less than a second, so 1,536 of a fleet behind one address can begin in that time.
+const STRANGERS_MAX: usize = 1536;
 /// Interval at which times of signs of life are stored.
 const SEEN_INTERVAL: Duration = Duration::from_secs(30);
 /// Interval at which waves of releases are looked at.
@@ -262,16 +267,12 @@ fn people_entrance(
     cloud: &Arc<Cloud>,
     is_behind_proxy: bool,
     stop: watch::Receiver<bool>,
-) -> Entrance {
-    Entrance {
-        listener,
-        router: people::router(cloud),
-        tls: None,
-        most: PEOPLE_MAX,
-        most_of_one: PEOPLE_OF_ONE_MAX,
-        is_behind_proxy,
-        stop,
-    }
+) -> Entrance<impl Listener<Addr = SocketAddr>> {
+    let listener = listener.tap_io(|stream| drop(stream.set_nodelay(true)));
+    let most = PEOPLE_MAX.min(gleaner_base::open_files_max() / 8);
+    let router = people::router(cloud).layer(map_response(counted));
+    let plain = Entrance::plain(listener, ("people connections", most), router, stop);
+    Entrance { is_behind_proxy, ..plain }
 }
 
 fn vehicles_entrance(
@@ -279,17 +280,20 @@ fn vehicles_entrance(
     cloud: &Arc<Cloud>,
     tls: watch::Receiver<Arc<ServerConfig>>,
     stop: watch::Receiver<bool>,
-) -> Entrance {
-    Entrance {
-        listener,
-        router: vehicles::router(cloud),
-        tls: Some(tls),
-        most: VEHICLES_MAX,
-        // Many can be behind one address of a mobile network, or behind a balancer.
-        most_of_one: VEHICLES_MAX,
-        is_behind_proxy: false,
-        stop,
-    }
+) -> Entrance<impl Listener<Addr = SocketAddr>> {
+    let listener = listener.tap_io(|stream| drop(stream.set_nodelay(true)));
+    // With those of people, an eighth of the descriptors is left for files: without one, neither a
+    // record nor a clip could be stored.
+    let eighth = gleaner_base::open_files_max() / 8;
+    let strangers = ("vehicle connections", STRANGERS_MAX.min(eighth));
+    let router = vehicles::router(cloud).layer(map_response(counted));
+    let plain = Entrance::plain(listener, strangers, router, stop);
+    Entrance { tls: Some(tls), known: VEHICLES_MAX.min(5 * eighth), ..plain }
+}
+
+async fn counted(answer: Response) -> Response {
+    COUNTS.answered(answer.status().as_u16());
+    answer
 }
 
 /// Spawns the chores that a cloud has with and without replicas.

@@ -10,11 +10,11 @@ use axum::response::{IntoResponse, Response};
 use futures_util::stream::try_unfold;
 use futures_util::{Stream, StreamExt, TryStreamExt};
 use gleaner_base::{Exit, Failure};
-use gleaner_fleet::{AnnouncedFile, UnfinishedFile};
+use gleaner_fleet::UnfinishedFile;
 use sha2::{Digest, Sha256};
 use tokio::fs::File;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::time::timeout;
+use tokio::time::{Instant, timeout, timeout_at};
 
 use crate::error::{CloudError, CloudResult};
 
@@ -46,42 +46,62 @@ impl IncomingFile<'_> {
         path: PathBuf,
         body: Body,
     ) -> CloudResult<UnfinishedFile> {
-        let time = piece_time + Duration::from_secs(self.length / RATE_MIN);
-        let receive = self.receive_in_time(piece_time, path, body);
-        timeout(time, receive).await.unwrap_or_else(|_| Err(self.late(time)))
+        let (received, end) = self.receive_some(piece_time, path, body).await?;
+        end?;
+        let ReceivedPiece { file, bytes, sha256 } = received;
+        match bytes == self.length && sha256 == self.sha256 {
+            true => Ok(file),
+            false => Err(self.refused(format!(
+                "it has {bytes} of {} bytes, and the SHA-256 {sha256}",
+                self.length
+            ))),
+        }
     }
 
-    async fn receive_in_time(
+    /// Receives as much as comes; also returns the reason why the body did not end in time.
+    pub(crate) async fn receive_some(
         self,
         piece_time: Duration,
         path: PathBuf,
         body: Body,
-    ) -> CloudResult<UnfinishedFile> {
-        let Self { name, length, sha256 } = self;
+    ) -> CloudResult<(ReceivedPiece, CloudResult<()>)> {
+        let Self { name, length, .. } = self;
         let failed = |error: io::Error| {
             Failure::caused_by(Exit::Internal, format!("cannot store {name}"), &error)
         };
-        let refused = |reason: String| {
-            let help = "send it again, as it was announced";
-            CloudError::denied(format!("{name} is refused"), help).because(reason)
-        };
         let mut file = File::create_new(&path).await.map_err(failed)?;
         let part = UnfinishedFile(path);
-        let mut announced = AnnouncedFile::new(length, sha256);
-        let mut body = body.into_data_stream();
-        loop {
-            let piece = timeout(piece_time, body.next()).await;
-            let Some(piece) = piece.map_err(|_| self.late(piece_time))? else { break };
-            let piece = piece.map_err(|error| {
-                let message = format!("{name} did not come in full");
-                CloudError::usage(message, "send it again").because(error)
-            })?;
-            announced.add(&piece).map_err(refused)?;
-            file.write_all(&piece).await.map_err(failed)?;
-        }
-        announced.finish().map_err(refused)?;
+        let (mut body, mut digest, mut bytes) = (body.into_data_stream(), Sha256::new(), 0);
+        let time = piece_time + Duration::from_secs(length / RATE_MIN);
+        let until = Instant::now() + time;
+        let end = loop {
+            let piece = match timeout_at(until.min(Instant::now() + piece_time), body.next()).await
+            {
+                Err(_) if Instant::now() < until => break Err(self.late(piece_time)),
+                Err(_) => break Err(self.late(time)),
+                Ok(None) => break Ok(()),
+                Ok(Some(Err(error))) => {
+                    let message = format!("{name} did not come in full");
+                    break Err(CloudError::usage(message, "send it again").because(error));
+                }
+                Ok(Some(Ok(piece))) => piece,
+            };
+            let fits = piece.len().min(usize::try_from(length - bytes).unwrap_or(usize::MAX));
+            digest.update(&piece[..fits]);
+            file.write_all(&piece[..fits]).await.map_err(failed)?;
+            bytes += fits as u64;
+            if fits < piece.len() {
+                break Err(self.refused(format!("it is longer than {length} bytes")));
+            }
+        };
         file.flush().await.map_err(failed)?;
-        Ok(part)
+        let sha256 = gleaner_base::hex(&digest.finalize());
+        Ok((ReceivedPiece { file: part, bytes, sha256 }, end))
+    }
+
+    fn refused(&self, reason: String) -> CloudError {
+        let help = "send it again, as it was announced";
+        CloudError::denied(format!("{} is refused", self.name), help).because(reason)
     }
 
     fn late(&self, time: Duration) -> CloudError {
@@ -89,6 +109,14 @@ impl IncomingFile<'_> {
         CloudError::late(message, "send it again, over a faster connection")
             .because(format!("nothing, or not all of it, came within {} s", time.as_secs()))
     }
+}
+
+/// Bytes of a file, as many as have come of them.
+#[derive(Debug)]
+pub(crate) struct ReceivedPiece {
+    pub(crate) file: UnfinishedFile,
+    pub(crate) bytes: u64,
+    pub(crate) sha256: String,
 }
 
 /// A stored file that an answer sends.

@@ -64,7 +64,6 @@ pub fn fuel_per_second() -> Result<f64, CompileError> {
     }
 }
 
-/// Returns the CPU time of this thread.
 fn cpu_time() -> Duration {
     let time = clock_gettime(ClockId::ThreadCPUTime);
     let seconds = u64::try_from(time.tv_sec).unwrap_or(0);

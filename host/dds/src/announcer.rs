@@ -107,6 +107,15 @@ impl Announcer {
         Self { announcements, announcement: None, own, group, senders, from, next }
     }
 
+    /// The addresses from which it is repeated.
+    pub(super) fn addresses(&self) -> Vec<Ipv4Addr> {
+        let address = |sender: &UdpSocket| match sender.local_addr().ok()?.ip() {
+            IpAddr::V4(address) => Some(address),
+            IpAddr::V6(_) => None,
+        };
+        self.senders.iter().filter_map(address).collect()
+    }
+
     /// Repeats the announcement from now on: a new participant may miss our answer to it.
     pub(super) fn restart(&mut self) {
         // A repetition that is due sooner stays, so that participants without end, each of which

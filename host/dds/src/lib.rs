@@ -11,7 +11,8 @@
 //!
 //! Never here: a sink that does more than copy while a lock of RustDDS is held; parsing of
 //! messages, other than those of the ROS 2 graph and type descriptions; a packet sent elsewhere
-//! than RustDDS sends it, and none with other bytes.
+//! than RustDDS sends it, and none with other bytes, but for the hash that the end of a reader or a
+//! writer lacks (`key_hash`).
 //!
 //! RustDDS does not expose bytes 2 and 3 of a sample's encapsulation (they are given as zeros). It
 //! drops samples that are badly broken by itself; they show as lost.
@@ -30,6 +31,7 @@ mod filter;
 mod graph;
 mod graph_message;
 mod joins;
+mod key_hash;
 mod names;
 mod nodes;
 mod options;
@@ -69,6 +71,7 @@ use discovery::ListedTopic;
 use gleaner_base::text::nearest;
 use gleaner_messages::{Definitions, Sources};
 use gleaner_protocol::NetworkStatus;
+use gleaner_protocol::ingress::JoinedParticipant;
 use gleaner_transport::{
     DefinitionsSearch, DiscoveredTopic, Health, LiveSource, PublishError, Publisher,
     ReceptionStatus, Sink, Subscription, TopicSpec, Transport, TransportError, same_type,
@@ -79,7 +82,7 @@ use receive::{ReceiverCommand, ReceiverHandle};
 use signal_mask::SignalMask;
 use sockets::Sockets;
 use state::{ParticipantState, SubscriptionStatus, lock};
-use topic_reader::TopicReader;
+use topic_reader::{TopicReader, kept};
 use type_check::TopicLayout;
 use watchdog::Watchdog;
 
@@ -106,6 +109,7 @@ pub struct Dds {
     thread: Option<JoinHandle<()>>,
     watchdog: Mutex<Watchdog>,
     domain: u16,
+    joined: JoinedParticipant,
     buffer: (usize, usize),
     real_time: bool,
     /// Topic, type and status of each subscription, by its number.
@@ -152,6 +156,11 @@ impl Dds {
         let filter = PacketFilter::new(&sockets, peers::prefix(&participant.guid()), &state);
         let own = peers::prefix(&participant.guid());
         let announcer = Announcer::new(announcements, own, options.domain, &options.interfaces);
+        let joined = JoinedParticipant {
+            prefix: own,
+            port: sockets::port_of_samples(options.domain) - 1,
+            addresses: announcer.addresses(),
+        };
         let (receiver, thread) =
             receive::start(&options, node, &participant, (filter, announcer), &state)?;
         info!(domain = options.domain, node = options.node, "joined");
@@ -162,6 +171,7 @@ impl Dds {
             thread: Some(thread),
             watchdog: Mutex::new(Watchdog::new(sockets, threads)),
             domain: options.domain,
+            joined,
             buffer: (asked, granted(asked, needed)),
             real_time: options.real_time,
             subscriptions: BTreeMap::new(),
@@ -363,6 +373,16 @@ impl LiveSource for Dds {
         };
         let dead = dead.or_else(|| ended.then(|| "the receive thread has ended".to_owned()));
         Health { network: Some(network), dead }
+    }
+
+    fn joined(&self) -> Option<JoinedParticipant> {
+        Some(self.joined.clone())
+    }
+
+    /// RustDDS keeps more than is asked for, so that few subscriptions need another reader.
+    fn suffices(&self, spec: &TopicSpec, wanted: &TopicSpec) -> bool {
+        let deeper = TopicSpec { queue: spec.queue.max(wanted.queue), ..spec.clone() };
+        wanted.max_bytes <= spec.max_bytes && kept(&deeper) <= kept(spec)
     }
 
     fn layout(&self, subscription: Subscription) -> Option<String> {

@@ -87,7 +87,7 @@ const WITH_INCOMPLETE: usize = 3;
 const DATAGRAM_BYTES: usize = 64 << 10;
 
 /// Number of samples that RustDDS keeps for a topic.
-fn kept(spec: &TopicSpec) -> usize {
+pub(super) fn kept(spec: &TopicSpec) -> usize {
     let bytes = spec.max_bytes.max(1);
     let (least, most) = KEPT.into_inner();
     let asked = match spec.qos {
@@ -459,6 +459,8 @@ mod tests {
         assert_eq!(kept(&spec(1, 25 << 20)), 4);
         assert_eq!(kept(&spec(10, 25 << 20)), 10);
         assert_eq!(kept(&spec(1, 0)), 1024);
+        // A lambda that asks for more of them needs no other reader.
+        assert_eq!(kept(&spec(256, 4096)), kept(&spec(512, 4096)));
     }
 
     #[test]

@@ -97,7 +97,6 @@ fn named(
     }
 }
 
-/// Returns all files in `folder`, which has no metadata.
 fn by_name(folder: &Path) -> Result<Bag, ReplayError> {
     let files = of_a_bag(folder)?;
     if files.is_empty() {

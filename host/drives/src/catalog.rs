@@ -28,7 +28,6 @@ const OTHER_HASH: &str = "a channel states a type hash that is not that of its d
 pub(super) struct DriveChannel {
     /// Index of its file.
     pub(super) file: usize,
-    /// Its id in that file.
     pub(super) id: u16,
     /// Number of the layout of its messages among those of its topic.
     pub(super) layout: u16,
@@ -58,7 +57,6 @@ struct DriveTopic {
     definitions: OnceLock<Arc<Definitions>>,
 }
 
-/// The layouts of one type on one topic.
 #[derive(Default)]
 struct Layouts {
     /// The definitions of each layout, as the first channel has them, in the order of channels.
@@ -70,7 +68,6 @@ struct Layouts {
 }
 
 impl Layouts {
-    /// Returns the number of a layout, with the definitions that have it.
     fn number(&mut self, digest: Option<[u8; 32]>, text: &Arc<str>) -> u16 {
         let known = match digest {
             Some(_) => self.digests.iter().position(|known| *known == digest),
@@ -192,7 +189,6 @@ impl DriveTopic {
     }
 }
 
-/// A topic that can be subscribed.
 pub(super) struct Selected<'a> {
     /// In the order of files and ids.
     pub(super) channels: &'a [DriveChannel],

@@ -46,7 +46,6 @@ const ROW_BYTES: usize = 128;
 /// Location of a database.
 #[derive(Copy, Clone)]
 pub(super) struct DatabaseFile<'a> {
-    /// Path of the database in messages.
     shown: &'a Path,
     real: &'a Path,
     /// Set if there may be a journal beside it.
@@ -64,7 +63,6 @@ impl<'a> DatabaseFile<'a> {
     }
 }
 
-/// Opens a database of `len` bytes.
 pub(super) fn open(
     file: DatabaseFile<'_>,
     len: u64,

@@ -75,7 +75,6 @@ pub struct Replay {
     /// Unpacks messages that are packed one by one.
     inflate: Inflate,
     limits: DriveLimits,
-    /// The times to replay.
     span: Span,
     /// The next message of every open segment, earliest on top.
     heads: BinaryHeap<Reverse<Head>>,
@@ -95,7 +94,6 @@ pub struct Replay {
     out_of_order: u64,
     /// Messages that were left out, by topic.
     malformed: BTreeMap<String, u64>,
-    /// The types of subscribed topics.
     types: BTreeMap<String, String>,
     progress: Progress,
 }

@@ -83,7 +83,6 @@ impl Channels {
         all.into_iter()
     }
 
-    /// Adds a topic of a database as a channel.
     #[cfg(feature = "bags")]
     pub(super) fn add(&mut self, id: u16, info: ChannelInfo) -> Result<(), Damage> {
         self.make_room(info.bytes() + info.definitions_text.as_ref().map_or(0, |text| text.len()))?;
@@ -257,7 +256,6 @@ pub(super) fn offered_qos(topic: &str, found: Option<&str>) -> Option<String> {
     Some(found.to_owned())
 }
 
-/// The result of scanning a file.
 #[derive(Default)]
 pub(super) struct Contents {
     pub(super) channels: Channels,

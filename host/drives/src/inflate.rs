@@ -32,7 +32,6 @@ impl Inflate {
         self.len as u64 >= self.allowed
     }
 
-    /// Returns the last unpacked message.
     pub(super) fn bytes(&self) -> &[u8] {
         &self.bytes[..self.len]
     }

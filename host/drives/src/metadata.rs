@@ -15,7 +15,6 @@ const SHOWN_CHARS: usize = 32;
 
 #[derive(Debug, PartialEq, Eq)]
 pub(super) struct BagMetadata {
-    /// The file names, at least one.
     pub(super) files: Vec<String>,
     /// Number of messages by topic, in all files.
     pub(super) messages: BTreeMap<String, u64>,
@@ -67,7 +66,6 @@ enum MetadataError {
     NoFiles,
 }
 
-/// Parses the text of a `metadata.yaml`.
 pub(super) fn read(text: &str) -> Result<BagMetadata, Box<dyn Error + Send + Sync>> {
     let options = serde_saphyr::options! {
         // Writers do not use aliases; they could make a small file expand to a large one.

@@ -16,7 +16,6 @@ pub(super) const MESSAGE_HEAD: usize = 22;
 /// Footer record and closing magic.
 pub(super) const FOOTER: u64 = HEAD + 20 + 8;
 
-/// Kinds of records, by their opcode.
 pub(super) mod op {
     pub(in super::super) const HEADER: u8 = 0x01;
     pub(in super::super) const FOOTER: u8 = 0x02;
@@ -50,7 +49,6 @@ impl<'a> Records<'a> {
     }
 }
 
-/// One record inside a buffer.
 #[derive(Copy, Clone)]
 pub(super) struct McapRecord<'a> {
     pub(super) opcode: u8,
@@ -244,7 +242,6 @@ impl ChunkIndex {
     }
 }
 
-/// The counts in the summary.
 pub(super) struct Statistics {
     pub(super) channels: u32,
     pub(super) chunks: u32,

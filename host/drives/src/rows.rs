@@ -35,7 +35,6 @@ pub(super) fn select(index: &str, list: &str, condition: &str) -> String {
 /// `SQLITE_IOERR_SHORT_READ`.
 const SHORT_READ: i32 = 522;
 
-/// A database being read.
 pub(super) struct MessageRows {
     path: PathBuf,
     /// `None` once everything is read: an open database keeps pages in memory.

@@ -59,7 +59,6 @@ pub(super) fn drives_of(
     Ok(drives.paths(recordings, &is_empty))
 }
 
-/// The times of two files.
 enum Relation {
     Apart,
     /// One has the next number of the other, and begins soon after its end.

@@ -20,7 +20,6 @@ use super::track::{Store, Track};
 use super::unpack::{Unpacked, unpack_one};
 use super::writers::Writers;
 
-/// Content of the metadata of a directory.
 #[derive(Default)]
 pub(super) struct Bag {
     /// In the order of the metadata.
@@ -198,7 +197,6 @@ fn database(
     Ok((Store::Rows(Box::new(rows)), contents))
 }
 
-/// Opens the content of a packed file.
 #[cfg(feature = "bags")]
 fn content(
     unpacked: &Unpacked,

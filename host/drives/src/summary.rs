@@ -12,7 +12,6 @@ use super::source::SourceFile;
 /// without it.
 const MAX_SUMMARY: u64 = 256 << 20;
 
-/// A complete summary.
 pub(super) struct Summary {
     pub(super) channels: Channels,
     /// By their offset in the file.
@@ -21,7 +20,6 @@ pub(super) struct Summary {
     pub(super) messages: HashMap<u16, u64>,
 }
 
-/// The end of a file.
 #[derive(Default)]
 pub(super) struct Tail {
     /// Set if footer and closing magic are present: the file was finished.
@@ -68,7 +66,6 @@ pub(super) struct Footer {
     pub(super) at: u64,
     /// Start of the summary; 0 if there is none.
     start: u64,
-    /// Checksum of the summary.
     crc: u32,
 }
 

@@ -47,14 +47,12 @@ impl Store {
     }
 }
 
-/// A file of a drive.
 pub(super) struct Track {
     store: Store,
     contents: Contents,
     times: Option<(u64, u64)>,
     /// Number of the recording that it belongs to.
     recording: usize,
-    /// The part to replay.
     span: Span,
     /// By channel id. Most files have a few channels with small ids, so a table beats a map.
     routes: Vec<Route>,
@@ -83,7 +81,6 @@ struct ChannelSubscription {
     max_bytes: usize,
 }
 
-/// A message on its way to a sink.
 pub(super) struct Routed<'a> {
     pub(super) subscription: Subscription,
     /// Set if this is the last subscription of the message.
@@ -132,7 +129,6 @@ impl Track {
         self.recording
     }
 
-    /// Returns the topics that have messages, or may have some.
     pub(super) fn topics(&self) -> impl Iterator<Item = &str> {
         let Contents { channels, messages, uncounted, .. } = &self.contents;
         let has_some = |id| *uncounted || messages.get(&id).is_some_and(|count| *count > 0);

@@ -44,7 +44,6 @@ pub struct Unpacked {
     pub(super) content: Arc<File>,
     /// The reason why the content is incomplete, if it is.
     pub(super) broken: Option<String>,
-    /// Current name of the content, if it has one.
     name: Option<ContentName>,
 }
 

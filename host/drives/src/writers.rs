@@ -14,7 +14,6 @@ use gleaner_transport::Guid;
 /// The first bytes of the identity of a writer that no file names.
 const MADE_UP: &[u8] = b"mcap";
 
-/// The writers of a drive, over all its files.
 #[derive(Default)]
 pub(super) struct Writers {
     files: u32,
@@ -53,7 +52,6 @@ impl ChannelWriter {
         self.numbers.last.fetch_max(seq, Relaxed);
     }
 
-    /// Counts a message with the recorded number `sequence`.
     pub(super) fn count(&self, sequence: u32) {
         let last = self.last_seq();
         // A named writer counts all its life; it has sent a sample twice if its number comes again.

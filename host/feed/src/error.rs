@@ -52,7 +52,6 @@ pub enum FeedError {
     },
 }
 
-/// A cause of a refusal, as text of the ingress.
 #[derive(Debug)]
 pub struct RefusalCause {
     text: String,

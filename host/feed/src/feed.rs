@@ -78,7 +78,6 @@ pub struct Feed {
     requests: IngressRequests,
     page: OwnPage,
     status: SourceStatus,
-    /// The topics that are attached, with their ids.
     attached: Vec<(u32, TopicMemory)>,
     /// Events that no call has returned yet.
     events: VecDeque<FeedEvent>,

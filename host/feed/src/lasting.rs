@@ -46,7 +46,6 @@ struct LastingTopic {
     losses: TopicLosses,
 }
 
-/// A time without an ingress.
 struct OpenGap {
     since: Instant,
     until: Instant,

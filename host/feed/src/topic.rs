@@ -64,7 +64,6 @@ pub(crate) enum AttachError {
 }
 
 impl OwnPage {
-    /// Maps the page of a received file.
     pub(crate) fn open(file: OwnedFd) -> Result<OwnPage, FeedError> {
         let control = ControlRegion::open(file).map_err(|source| FeedError::Control { source })?;
         Ok(OwnPage { control, taken: vec![false; HAZARDS].into() })

@@ -34,7 +34,6 @@ struct FakeIngress {
     control: ControlRegion,
 }
 
-/// Returns an ingress and a reader that is connected to it.
 fn connected() -> (FakeIngress, Feed) {
     let (ingress_end, reader_end) = UnixStream::pair().unwrap();
     let mut link = ReaderLink::new(ingress_end.into());

@@ -52,6 +52,8 @@ pub(crate) struct GrantedSession {
 
 #[derive(Debug)]
 pub(crate) struct ConnectedLambda {
+    /// Its identity, by which its time is counted.
+    pub(crate) id: String,
     pub(crate) name: String,
     /// Largest size of its inputs, and of its outputs, in bytes.
     pub(crate) memory: u64,
@@ -72,10 +74,11 @@ pub(crate) struct ConnectedLambda {
 impl ConnectedLambda {
     pub(crate) fn new(add: AddClient, socket: OwnedFd) -> Self {
         let granted = |model: GrantedModel| {
-            let key = SessionKey::of(&model);
+            let key = model.load();
             (model.name, GrantedSession { key, refused: model.refused })
         };
         Self {
+            id: add.id,
             name: add.name,
             memory: add.memory.min(MAX_TENSOR_BYTES),
             socket: ModelSocket::new(socket),

@@ -1,33 +1,32 @@
 //! The loop: owns the lambdas, the sessions and the order of runs. It never waits for a lambda or a
 //! model.
 
-use std::collections::HashMap;
-use std::fs::File;
 use std::os::fd::OwnedFd;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use gleaner_protocol::inference::{
-    InferenceReport, InferenceRequest, InferenceServer, InferenceStatus, ModelCall, ModelEngine,
-    ModelFaultKind, ModelFile, ModelRequest, ModelResult, TensorPlace,
+    InferenceReport, InferenceRequest, InferenceServer, InferenceStatus, ModelCall, ModelFaultKind,
+    ModelRequest, ModelResult, TensorPlace,
 };
 use gleaner_protocol::link::Incoming;
 use gleaner_vitals::{monotonic_ns, usage};
 use tracing::{error, info};
 
-use crate::backend::StopSignal;
 use crate::client::{CallStage, ConnectedLambda, LambdaId, OpenCall};
 use crate::engine_error::EngineError;
 use crate::lambdas::{LambdaTable, ReadyDescriptors, TOO_MANY};
-use crate::loader::{LoadDone, LoadJob, PassedEngine};
-use crate::loads::LoadQueue;
-use crate::places::{PlacedInput, check_inputs};
-use crate::queue::FairQueue;
-use crate::sessions::{LoadState, SessionId, SessionKey, SessionTable};
+use crate::loader::{LoadDone, LoadJob};
+use crate::loads::{LoadQueue, PassedFiles};
+use crate::places::check_inputs;
+use crate::schedule::{RunSchedule, WaitingRun};
+use crate::sessions::{LoadState, SessionTable};
 use crate::threads::{ModelThreads, ThreadResult};
-use crate::worker::{LastRun, RunDone, RunJob, RunOutputs, WorkerModel, WorkerRequest};
+use crate::worker::{LastRun, RunDone, RunJob, RunOutputs, WorkerModel};
 
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);
+/// Longest time without a status: the starter ends a process that is silent.
+const SILENCE: Duration = Duration::from_secs(5);
 /// Interval of checks for models that take too long.
 const WORK_INTERVAL: Duration = Duration::from_millis(100);
 /// Time for a run to end when the process ends.
@@ -40,28 +39,19 @@ pub(crate) struct InferenceEngine {
     threads: ModelThreads,
     reports: ReportSink,
     lambdas: LambdaTable,
-    /// Files by digest.
-    files: HashMap<String, PassedModel>,
+    files: PassedFiles,
     sessions: SessionTable,
     loads: LoadQueue,
-    queue: FairQueue<LambdaId, Vec<PlacedInput>>,
-    run: Option<RunInProgress>,
-    last_job: u64,
+    schedule: RunSchedule,
+    /// Set if the starter tries each load in another process first.
+    has_trials: bool,
+    /// The next load, and whether its trial is over.
+    trial: Option<(LoadJob, bool)>,
+    /// Until then, models are loaded and run one at a time.
+    apart_until: Instant,
     status_at: Instant,
+    reported: Instant,
     status: InferenceStatus,
-}
-
-/// A file that the starter has passed.
-struct PassedModel {
-    path: String,
-    file: Arc<File>,
-    engine: PassedEngine,
-}
-
-struct RunInProgress {
-    job: u64,
-    lambda: LambdaId,
-    stop: Arc<StopSignal>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -71,18 +61,28 @@ enum EngineEnd {
 }
 
 impl InferenceEngine {
-    pub(crate) fn new(threads: ModelThreads, reports: ReportSink) -> Self {
+    /// Creates the loop. `has_trials` if the starter tries each load in another process first;
+    /// for the time `apart`, models are loaded and run one at a time.
+    pub(crate) fn new(
+        threads: ModelThreads,
+        reports: ReportSink,
+        has_trials: bool,
+        apart: Duration,
+    ) -> Self {
+        let now = Instant::now();
         Self {
             threads,
             reports,
             lambdas: LambdaTable::default(),
-            files: HashMap::new(),
+            files: PassedFiles::default(),
             sessions: SessionTable::default(),
             loads: LoadQueue::default(),
-            queue: FairQueue::default(),
-            run: None,
-            last_job: 0,
-            status_at: Instant::now() + STATUS_INTERVAL,
+            schedule: RunSchedule::default(),
+            has_trials,
+            trial: None,
+            apart_until: now + apart,
+            status_at: now + STATUS_INTERVAL,
+            reported: now,
             status: InferenceStatus::default(),
         }
     }
@@ -100,9 +100,7 @@ impl InferenceEngine {
         (self.reports)(InferenceReport::Ready);
         let end = self.serve(&mut control, stop)?;
         info!(reason = ?end, "gleaner-inference ends");
-        if let Some(run) = &self.run {
-            run.stop.stop();
-        }
+        self.schedule.stop(None);
         self.threads.wait_idle(END_TIMEOUT);
         let status = self.current_status();
         (self.reports)(InferenceReport::Ended(status));
@@ -142,7 +140,7 @@ impl InferenceEngine {
             self.remove_gone();
             self.check_deadlines();
             self.start_load();
-            self.start_run();
+            self.start_runs();
             self.tick()?;
         }
     }
@@ -156,8 +154,10 @@ impl InferenceEngine {
         if self.threads.are_busy() {
             timeout = timeout.min(WORK_INTERVAL);
         }
-        if let Some(deadline) = self.lambdas.next_deadline() {
-            timeout = timeout.min(Duration::from_nanos(deadline.saturating_sub(monotonic_ns())));
+        let now_ns = monotonic_ns();
+        let changes = [self.lambdas.next_deadline(), self.schedule.changes_at(now_ns)];
+        for at in changes.into_iter().flatten() {
+            timeout = timeout.min(Duration::from_nanos(at.saturating_sub(now_ns)));
         }
         self.lambdas.wait(control, self.threads.wake(), stop, timeout).map_err(EngineError::Wait)
     }
@@ -166,17 +166,24 @@ impl InferenceEngine {
         loop {
             match control.poll() {
                 Ok(Incoming::Message(InferenceRequest::Model(model, file, entry))) => {
-                    let ModelFile { sha256, path, engine } = model;
-                    let entry = entry.map(|it| Arc::new(File::from(it)));
-                    let engine = match engine {
-                        ModelEngine::Refused(reason) => Err(reason),
-                        ModelEngine::None | ModelEngine::Attached => Ok(entry),
-                    };
-                    let file = Arc::new(File::from(file));
-                    self.files.insert(sha256, PassedModel { path, file, engine });
+                    self.files.add(model, file, entry);
                 }
                 Ok(Incoming::Message(InferenceRequest::Client(add, socket))) => {
+                    self.schedule.allow(&add.id, add.demand);
                     self.lambdas.add(add, socket);
+                }
+                Ok(Incoming::Message(InferenceRequest::Tried(load, refused))) => {
+                    if let Some((job, _)) = self.trial.take_if(|(job, _)| job.key == load) {
+                        let session = job.session;
+                        match refused {
+                            Some(why) => {
+                                self.finish_load(LoadDone { session, loaded: Err(why) });
+                                // The starter knows for how long, and is asked again.
+                                self.sessions.remove(session);
+                            }
+                            None => self.trial = Some((job, true)),
+                        }
+                    }
                 }
                 Ok(Incoming::Message(InferenceRequest::Stop)) => return Some(EngineEnd::Stopped),
                 Ok(Incoming::Nothing) => return None,
@@ -192,11 +199,9 @@ impl InferenceEngine {
 
     fn handle_request(&mut self, id: LambdaId, request: ModelRequest) {
         self.expire(id, monotonic_ns());
-        let Some(lambda) = self.lambdas.get_mut(id) else { return };
         // It has given up the call before: its time was over, or it made that call to a process
         // before this one.
-        let before = lambda.call.take();
-        if let Some(before) = before {
+        if let Some(before) = self.lambdas.get_mut(id).and_then(|lambda| lambda.call.take()) {
             self.abandon(id, before.stage);
         }
         let is_beyond = self.lambdas.is_beyond(id);
@@ -225,39 +230,38 @@ impl InferenceEngine {
         }
         let key = granted.key.clone();
         let session = match self.sessions.find(&key) {
-            Some(session) => session,
-            None => match self.load(key) {
-                Ok(session) => session,
-                Err(message) => {
-                    let Some(lambda) = self.lambdas.get_mut(id) else { return };
-                    return lambda.fail(call, ModelFaultKind::Failed, message);
-                }
-            },
+            Some(session) => Ok(session),
+            None => self.files.load(key, &self.lambdas, &mut self.sessions, &mut self.loads),
         };
-        if let Some(lambda) = self.lambdas.get_mut(id) {
-            let (outputs, stage) = (0, CallStage::Loading);
-            lambda.call = Some(OpenCall { id: call, deadline_ns, model, session, outputs, stage });
+        let Some(lambda) = self.lambdas.get_mut(id) else { return };
+        let (outputs, stage) = (0, CallStage::Loading);
+        match session {
+            Ok(session) => {
+                let call = OpenCall { id: call, deadline_ns, model, session, outputs, stage };
+                lambda.call = Some(call);
+            }
+            Err(message) => return lambda.fail(call, ModelFaultKind::Failed, message),
         }
         self.answer_open(id);
     }
 
-    /// Begins to load a model.
-    fn load(&mut self, key: SessionKey) -> Result<SessionId, String> {
-        let Some(PassedModel { path, file, engine }) = self.files.get(&key.sha256) else {
-            return Err(format!("the starter passed no file with the digest {}", key.sha256));
-        };
-        let (path, file, engine) = (path.clone(), Arc::clone(file), engine.clone());
-        let lambdas = self.lambdas.users(&key);
-        let session = self.sessions.add(key.clone(), path.clone());
-        self.loads.push(LoadJob { session, key, file, engine, path, lambdas });
-        Ok(session)
-    }
-
-    /// Starts the next load, if none is in progress.
+    /// Starts the next load, if none is in progress: first its trial.
     fn start_load(&mut self) {
         if let Some(job) = self.loads.begin(&self.lambdas, &mut self.sessions) {
+            if self.has_trials {
+                (self.reports)(InferenceReport::Try(job.key.clone()));
+            }
+            self.trial = Some((job, !self.has_trials));
+        }
+        if (!self.is_apart() || self.schedule.is_idle())
+            && let Some((job, _)) = self.trial.take_if(|(_, is_over)| *is_over)
+        {
             self.threads.load(job);
         }
+    }
+
+    fn is_apart(&self) -> bool {
+        Instant::now() < self.apart_until
     }
 
     /// Answers a lambda that opens a model, unless that is still being loaded.
@@ -313,7 +317,8 @@ impl InferenceEngine {
                 let stage = CallStage::Waiting;
                 lambda.call =
                     Some(OpenCall { id: call, deadline_ns, model, session, outputs, stage });
-                self.queue.push(id, deadline_ns, placed);
+                let run = WaitingRun { account: lambda.id.clone(), session, inputs: placed };
+                self.schedule.push(id, deadline_ns, run);
             }
             Err(error) => {
                 let message = format!("model `{model}`: {error}");
@@ -323,29 +328,37 @@ impl InferenceEngine {
         }
     }
 
-    /// Starts the next run, if none is in progress.
-    fn start_run(&mut self) {
-        while self.run.is_none() {
-            let Some((id, inputs)) = self.queue.pop() else { return };
-            let Some(lambda) = self.lambdas.get_mut(id) else { continue };
-            let Some(call) = &mut lambda.call else { continue };
-            self.last_job += 1;
-            let (job, stop) = (self.last_job, Arc::new(StopSignal::default()));
+    /// Starts the runs that may begin now.
+    fn start_runs(&mut self) {
+        let is_apart = self.is_apart();
+        if is_apart && self.loads.is_busy() && self.trial.is_none() {
+            return;
+        }
+        while let Some((run, inputs)) = self.schedule.begin(is_apart, monotonic_ns()) {
+            let (job, stop) = (run.job, Arc::clone(&run.stop));
+            let lambda = self.lambdas.get_mut(run.lambda);
+            let call = lambda.and_then(|it| Some((it.call.take()?, it)));
+            let model = call.as_ref().and_then(|(call, _)| self.threads.model(call.session));
+            let (Some((mut call, lambda)), Some(model)) = (call, model) else {
+                self.schedule.finish(job, 0, monotonic_ns());
+                continue;
+            };
             let left =
                 call.deadline_ns.map(|at| Duration::from_nanos(at.saturating_sub(monotonic_ns())));
             call.stage = CallStage::Running(job);
-            self.threads.request(WorkerRequest::Run(RunJob {
+            self.threads.run(RunJob {
                 job,
                 session: call.session,
-                lambda: lambda.name.clone(),
+                model,
+                lambda: [lambda.id.clone(), lambda.name.clone()],
                 inputs,
                 input_region: lambda.inputs.clone(),
                 output_region: lambda.outputs.clone(),
                 memory: lambda.memory,
                 left,
-                stop: Arc::clone(&stop),
-            }));
-            self.run = Some(RunInProgress { job, lambda: id, stop });
+                stop,
+            });
+            lambda.call = Some(call);
         }
     }
 
@@ -362,7 +375,7 @@ impl InferenceEngine {
                     outputs: ready.outputs.clone(),
                     last: LastRun::default(),
                 };
-                self.threads.request(WorkerRequest::Add(id, model));
+                self.threads.add_model(id, model);
                 LoadState::Ready(ready)
             }
             Err(reason) => LoadState::Failed(reason),
@@ -379,14 +392,14 @@ impl InferenceEngine {
 
     fn finish_run(&mut self, done: RunDone) {
         let RunDone { job, session, result, ran_ns } = done;
-        let Some(run) = self.run.take_if(|run| run.job == job) else { return };
+        let ran = ran_ns.unwrap_or(0);
+        let Some(run) = self.schedule.finish(job, ran, monotonic_ns()) else { return };
         let waits = |call: &mut OpenCall| call.stage == CallStage::Running(job);
         let lambda = self.lambdas.get_mut(run.lambda);
         let answered = lambda.and_then(|it| Some((it.call.take_if(waits)?, it)));
-        if let Some(session) = self.sessions.get_mut(session) {
-            let counts = &mut session.counts;
+        if let Some(counts) = self.sessions.get_mut(session).map(|it| &mut it.counts) {
             counts.runs += u64::from(ran_ns.is_some());
-            counts.run_ns = counts.run_ns.saturating_add(ran_ns.unwrap_or(0));
+            counts.run_ns = counts.run_ns.saturating_add(ran);
             // A call that was answered at its deadline is counted already.
             counts.shared += u64::from(ran_ns.is_none() && result.is_ok());
             counts.failed += u64::from(answered.is_some() && result.is_err());
@@ -436,12 +449,8 @@ impl InferenceEngine {
     fn abandon(&mut self, id: LambdaId, stage: CallStage) {
         match stage {
             CallStage::Loading => {}
-            CallStage::Waiting => drop(self.queue.remove(id)),
-            CallStage::Running(job) => {
-                if let Some(run) = self.run.as_ref().filter(|run| run.job == job) {
-                    run.stop.stop();
-                }
-            }
+            CallStage::Waiting => self.schedule.remove(id),
+            CallStage::Running(job) => self.schedule.stop(Some(job)),
         }
     }
 
@@ -466,12 +475,13 @@ impl InferenceEngine {
         self.status_at = now + STATUS_INTERVAL;
         self.lambdas.begin_second();
         for session in self.sessions.remove_unused(|key| self.lambdas.use_session(key), now) {
-            self.threads.request(WorkerRequest::Remove(session));
+            self.threads.remove_model(session);
         }
         let status = self.current_status();
         let same_memory =
             InferenceStatus { resident_bytes: self.status.resident_bytes, ..status.clone() };
-        if same_memory != self.status {
+        if same_memory != self.status || now >= self.reported + SILENCE {
+            self.reported = now;
             self.status = status.clone();
             (self.reports)(InferenceReport::Status(status));
         }

@@ -159,7 +159,7 @@ mod tests {
         let (_lambda, socket) = ModelClient::pair().unwrap();
         let mut table = LambdaTable::default();
         for _ in 0..=LAMBDAS {
-            let add = AddClient { name: "many".to_owned(), memory: 0, models: Vec::new() };
+            let add = AddClient { name: "many".to_owned(), ..AddClient::default() };
             table.add(add, socket.try_clone().unwrap());
         }
         let (first, last) = (LambdaId(1), LambdaId(LAMBDAS as u64 + 1));

@@ -4,8 +4,9 @@
 //!   never waits.
 //! - `client`, `lambdas`: a connected lambda, and all of them. `sessions`: models with their
 //!   options, shared by lambdas.
-//! - [`queue`]: the order of runs. `loads`: that of loads. [`places`]: checks of requests.
-//! - `threads`, `loader`, `worker`: the thread that checks and loads models, and the one that runs
+//! - `schedule`, [`queue`]: the order of runs, and which ones run beside others.
+//!   `loads`: the order of loads, and their files. [`places`]: checks of requests.
+//! - `threads`, `loader`, `worker`: the thread that checks and loads models, and those that run
 //!   them. `running`: notes for the starter which model is in use, and the limits of time.
 //! - `region`: memory that is shared with a lambda.
 //! - [`inspect`]: checks of a model's file before a library parses it.
@@ -32,6 +33,7 @@ pub mod program;
 pub mod queue;
 mod region;
 mod running;
+mod schedule;
 mod sessions;
 mod threads;
 mod worker;

@@ -79,7 +79,7 @@ impl ModelLoader {
     pub(crate) fn load(&self, job: &LoadJob) -> LoadDone {
         let (limit, stop) = (self.limits.load_max, Arc::new(StopSignal::default()));
         self.note.begin(ModelWork {
-            sha256: job.key.sha256.clone(),
+            note: job.key.sha256.clone(),
             path: job.path.clone(),
             lambdas: job.lambdas.clone(),
             until: Instant::now() + limit,

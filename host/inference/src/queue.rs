@@ -1,7 +1,8 @@
 //! The order of runs: the earliest deadline first, without waiting for a flood.
 //!
 //! A waiting entry is overtaken at most once by each other owner. So an owner that always has the
-//! earliest deadline delays another one by one run at most.
+//! earliest deadline delays another one by one run at most. Entries that may not be taken yet are
+//! passed without that limit.
 
 use std::collections::HashSet;
 use std::hash::Hash;
@@ -41,21 +42,26 @@ impl<O: Copy + Eq + Hash, T> FairQueue<O, T> {
         Some(self.waiting.remove(index).entry)
     }
 
-    /// Takes the next entry.
-    pub fn pop(&mut self) -> Option<(O, T)> {
-        let may_be_next = |index: usize| {
-            let owner = &self.waiting[index].owner;
-            self.waiting[..index].iter().all(|earlier| !earlier.overtaken_by.contains(owner))
+    /// Takes the next entry of those that `may` be taken now.
+    pub fn pop(&mut self, mut may: impl FnMut(&T) -> bool) -> Option<(O, T)> {
+        let mut ready: Vec<_> = self.waiting.iter_mut().filter(|it| may(&it.entry)).collect();
+        let may_be_next = |place: &usize| {
+            let owner = &ready[*place].owner;
+            ready[..*place].iter().all(|earlier| !earlier.overtaken_by.contains(owner))
         };
         // An entry without a deadline comes last; among equal ones, the first that arrived.
-        let next = (0..self.waiting.len())
-            .filter(|index| may_be_next(*index))
-            .min_by_key(|index| (self.waiting[*index].deadline.unwrap_or(u64::MAX), *index))?;
-        let next_entry = self.waiting.remove(next);
-        for earlier in &mut self.waiting[..next] {
-            earlier.overtaken_by.insert(next_entry.owner);
+        let deadline = |place: &usize| (ready[*place].deadline.unwrap_or(u64::MAX), *place);
+        let next = (0..ready.len()).filter(may_be_next).min_by_key(deadline)?;
+        let owner = ready[next].owner;
+        for earlier in &mut ready[..next] {
+            earlier.overtaken_by.insert(owner);
         }
-        Some((next_entry.owner, next_entry.entry))
+        Some((owner, self.remove(owner)?))
+    }
+
+    /// Returns whether no entry waits.
+    pub fn is_empty(&self) -> bool {
+        self.waiting.is_empty()
     }
 }
 
@@ -69,7 +75,8 @@ mod tests {
         for (owner, deadline) in [(1, None), (2, Some(30)), (3, Some(10)), (4, Some(30))] {
             queue.push(owner, deadline, ());
         }
-        let order: Vec<_> = std::iter::from_fn(|| queue.pop()).map(|(owner, ())| owner).collect();
+        let popped = std::iter::from_fn(|| queue.pop(|()| true));
+        let order: Vec<_> = popped.map(|(owner, ())| owner).collect();
         assert_eq!(order, [3, 2, 4, 1]);
     }
 
@@ -80,7 +87,7 @@ mod tests {
         let mut order = Vec::new();
         for round in 0..3 {
             queue.push("flood", Some(round), ());
-            order.push(queue.pop().unwrap().0);
+            order.push(queue.pop(|()| true).unwrap().0);
             if order.last() != Some(&"flood") {
                 queue.push("slow", None, ());
                 queue.remove("flood");
@@ -97,7 +104,7 @@ mod tests {
         queue.push('a', Some(1), ());
         queue.push('b', Some(2), ());
         for _ in 0..5 {
-            let (owner, ()) = queue.pop().unwrap();
+            let (owner, ()) = queue.pop(|()| true).unwrap();
             order.push(owner);
             // Each returns at once, with an earlier deadline than all others.
             queue.push(owner, Some(if owner == 'c' { 100 } else { 1 }), ());
@@ -111,6 +118,7 @@ mod tests {
         queue.push(1, Some(1), 'a');
         queue.push(2, Some(2), 'b');
         assert_eq!((queue.remove(1), queue.remove(1)), (Some('a'), None));
-        assert_eq!((queue.pop(), queue.pop()), (Some((2, 'b')), None));
+        let mut pop = || queue.pop(|_| true);
+        assert_eq!((pop(), pop()), (Some((2, 'b')), None));
     }
 }

@@ -6,27 +6,17 @@ use std::os::unix::fs::FileExt;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
+use gleaner_protocol::inference::NOTE_BYTES;
+
 use crate::backend::StopSignal;
 
 /// Time for an overdue run to end after its backend was notified.
 const STOP_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Length of a note: the hexadecimal digits of SHA-256.
-const NOTE_BYTES: usize = 64;
-
-/// Kind of work, and with it the place of its note in the file.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum WorkKind {
-    /// The model is being loaded, at the first place of the file.
-    Load,
-    /// The model runs, at the second one.
-    Run,
-}
-
 #[derive(Debug, Clone)]
 pub(crate) struct ModelWork {
-    /// SHA-256 of the file.
-    pub(crate) sha256: String,
+    /// SHA-256 of the file, and while it runs, a space and the identity of the lambda.
+    pub(crate) note: String,
     pub(crate) path: String,
     /// Names of the lambdas that requested it.
     pub(crate) lambdas: Vec<String>,
@@ -41,23 +31,20 @@ pub(crate) struct ModelWork {
 /// The work of one thread, noted in the file while it lasts.
 #[derive(Debug, Clone)]
 pub(crate) struct WorkNote {
-    kind: WorkKind,
+    /// Place of its note: 0 for the load.
+    place: usize,
     file: Option<Arc<File>>,
     work: Arc<Mutex<Option<ModelWork>>>,
 }
 
 impl WorkNote {
     /// Creates the note of a thread. Without a file, only the time is limited.
-    pub(crate) fn new(kind: WorkKind, file: Option<Arc<File>>) -> Self {
-        Self { kind, file, work: Arc::default() }
+    pub(crate) fn new(place: usize, file: Option<Arc<File>>) -> Self {
+        Self { place, file, work: Arc::default() }
     }
 
     pub(crate) fn begin(&self, work: ModelWork) {
-        let mut note = [0; NOTE_BYTES];
-        let digits = work.sha256.as_bytes();
-        let length = digits.len().min(NOTE_BYTES);
-        note[..length].copy_from_slice(&digits[..length]);
-        self.write(&note);
+        self.write(&work.note);
         *self.lock() = Some(work);
     }
 
@@ -70,14 +57,15 @@ impl WorkNote {
 
     pub(crate) fn end(&self) {
         *self.lock() = None;
-        self.write(&[0; NOTE_BYTES]);
+        self.write("");
     }
 
     pub(crate) fn is_busy(&self) -> bool {
         self.lock().is_some()
     }
 
-    /// Returns the work in progress if it takes too long and cannot be interrupted.
+    /// Returns the work in progress if it takes too long and cannot be interrupted. It is the only
+    /// one that is noted then, as this process has to end.
     pub(crate) fn overdue(&self, now: Instant) -> Option<ModelWork> {
         let mut work = self.lock();
         let overdue = work.as_mut().filter(|work| work.until <= now)?;
@@ -85,69 +73,66 @@ impl WorkNote {
             overdue.until = now + STOP_TIMEOUT;
             return None;
         }
+        if let Some(file) = &self.file {
+            // If it fails, the starter charges none of several models.
+            let _ = file.set_len(0);
+        }
+        self.write(&overdue.note);
         Some(overdue.clone())
     }
 
-    fn lock(&self) -> std::sync::MutexGuard<'_, Option<ModelWork>> {
-        self.work.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    fn write(&self, note: &[u8; NOTE_BYTES]) {
-        let offset = match self.kind {
-            WorkKind::Load => 0,
-            WorkKind::Run => NOTE_BYTES as u64,
-        };
+    fn write(&self, text: &str) {
+        let mut note = text.as_bytes().to_vec();
+        note.resize(NOTE_BYTES, 0);
         if let Some(file) = &self.file
-            && let Err(error) = file.write_all_at(note, offset)
+            && let Err(error) = file.write_all_at(&note, (self.place * NOTE_BYTES) as u64)
         {
             // The starter then blames no model.
             tracing::debug!(%error, "cannot note the model in use");
         }
     }
+
+    fn lock(&self) -> std::sync::MutexGuard<'_, Option<ModelWork>> {
+        self.work.lock().unwrap_or_else(PoisonError::into_inner)
+    }
 }
 
 #[cfg(test)]
 mod tests {
+    use gleaner_protocol::inference::models_in_use;
+
     use super::*;
 
     #[test]
-    fn work_is_noted_while_it_lasts_and_is_overdue_after_its_limit() {
+    fn work_is_noted_while_it_lasts_and_alone_once_it_is_overdue() {
         let file = Arc::new(tempfile::tempfile().unwrap());
-        let (load, run) = (
-            WorkNote::new(WorkKind::Load, Some(Arc::clone(&file))),
-            WorkNote::new(WorkKind::Run, Some(Arc::clone(&file))),
-        );
-        let read = || {
-            let mut text = [b'?'; 128];
-            file.read_at(&mut text, 0).unwrap();
-            text.map(|byte| if byte == 0 { b'-' } else { byte })
-        };
-        let (now, limit) = (Instant::now(), Duration::from_secs(60));
-        let work = |digit: &str| ModelWork {
-            sha256: digit.repeat(64),
+        let [load, run] = [0, 2].map(|place| WorkNote::new(place, Some(Arc::clone(&file))));
+        let limit = Duration::from_secs(60);
+        let now = Instant::now();
+        let work = |note: &str| ModelWork {
+            note: note.to_owned(),
             path: String::new(),
             lambdas: Vec::new(),
             until: now + limit,
             limit,
             stop: Arc::default(),
         };
-        run.begin(work("b"));
+        run.begin(work("b front"));
         load.begin(work("a"));
-        assert_eq!(read()[..], ["a".repeat(64), "b".repeat(64)].concat().as_bytes()[..]);
+        assert_eq!(models_in_use(&file), ["a", "b front"]);
         assert!(run.is_busy() && run.overdue(now).is_none());
-        assert!(run.overdue(now + limit).is_some_and(|work| work.sha256.starts_with('b')));
-        run.limit(Duration::ZERO);
-        assert!(run.overdue(Instant::now()).is_some());
-        let interruptible = work("b");
+        let interruptible = work("b front");
         interruptible.stop.on_stop(|| {});
         run.begin(interruptible);
         let late = now + limit;
         assert!(run.overdue(late).is_none(), "it is interrupted");
         assert!(run.overdue(late).is_none(), "it has a while to end");
-        assert!(run.overdue(late + STOP_TIMEOUT).is_some());
         load.end();
-        assert_eq!(read()[..], ["-".repeat(64), "b".repeat(64)].concat().as_bytes()[..]);
+        assert_eq!(models_in_use(&file), ["b front"]);
+        load.begin(work("a"));
+        assert!(run.overdue(late + STOP_TIMEOUT).is_some_and(|work| work.note == "b front"));
+        assert_eq!(models_in_use(&file), ["b front"], "it is the cause of the end");
         run.end();
-        assert!(!run.is_busy() && read() == [b'-'; 128]);
+        assert!(!run.is_busy() && models_in_use(&file).is_empty());
     }
 }

@@ -5,35 +5,16 @@
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-use gleaner_protocol::inference::{GrantedModel, LoadedModel, ModelState, TensorInfo};
+use gleaner_protocol::inference::{LoadedModel, ModelState, TensorInfo};
 
 /// Time for which a session without lambdas is kept: a lambda that is restarted finds it loaded.
 const KEPT: Duration = Duration::from_secs(60);
-
-/// Largest number of threads of one run.
-const MAX_THREADS: u32 = 64;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub(crate) struct SessionId(u64);
 
 /// The file and the options of a session.
-#[derive(Debug, Clone, PartialEq, Eq, Hash)]
-pub(crate) struct SessionKey {
-    pub(crate) sha256: String,
-    pub(crate) providers: Vec<String>,
-    pub(crate) threads: u32,
-}
-
-impl SessionKey {
-    /// Returns the key of a model that a lambda may use.
-    pub(crate) fn of(granted: &GrantedModel) -> SessionKey {
-        SessionKey {
-            sha256: granted.sha256.clone(),
-            providers: granted.providers.clone(),
-            threads: granted.threads.unwrap_or(1).clamp(1, MAX_THREADS),
-        }
-    }
-}
+pub(crate) use gleaner_protocol::inference::TryLoad as SessionKey;
 
 #[derive(Debug, Clone)]
 pub(crate) enum LoadState {

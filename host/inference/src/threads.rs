@@ -1,22 +1,25 @@
-//! The two threads beside the loop: one loads models, one runs them.
+//! The threads beside the loop: one loads models, the others run them.
 
+use std::collections::HashMap;
 use std::fs::File;
 use std::io;
 use std::os::fd::OwnedFd;
 use std::path::PathBuf;
-use std::sync::Arc;
 use std::sync::mpsc::{Receiver, Sender, channel};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{Builder, JoinHandle};
 use std::time::{Duration, Instant};
 
+use gleaner_protocol::inference::MODEL_WORKERS;
 use rustix::event::{EventfdFlags, eventfd};
 
 use crate::backend::Backends;
 use crate::loader::{LoadDone, LoadJob, LoadLimits, ModelLoader};
-use crate::running::{ModelWork, WorkKind, WorkNote};
-use crate::worker::{ModelWorker, RunDone, WorkerRequest};
+use crate::running::{ModelWork, WorkNote};
+use crate::sessions::SessionId;
+use crate::worker::{ModelWorker, RunDone, RunJob, SharedModel, WorkerModel};
 
-/// Stack of both threads: libraries follow graphs by recursion.
+/// Stack of each thread: libraries follow graphs by recursion.
 const STACK_BYTES: usize = 16 << 20;
 
 pub(crate) enum ThreadResult {
@@ -24,15 +27,15 @@ pub(crate) enum ThreadResult {
     Ran(RunDone),
 }
 
-/// The threads, as the loop uses them.
 pub(crate) struct ModelThreads {
     loads: Sender<LoadJob>,
-    runs: Sender<WorkerRequest>,
+    runs: Sender<RunJob>,
+    models: HashMap<SessionId, SharedModel>,
     results: Receiver<ThreadResult>,
     /// Readable when there is a result.
     wake: Arc<OwnedFd>,
-    notes: [WorkNote; 2],
-    threads: [JoinHandle<()>; 2],
+    notes: Vec<WorkNote>,
+    threads: Vec<JoinHandle<()>>,
 }
 
 /// Sends results, and wakes the loop.
@@ -62,32 +65,36 @@ impl ModelThreads {
         running: Option<File>,
     ) -> io::Result<Self> {
         let running = running.map(Arc::new);
-        let notes = [WorkKind::Load, WorkKind::Run].map(|it| WorkNote::new(it, running.clone()));
+        let notes: Vec<WorkNote> =
+            (0..=MODEL_WORKERS).map(|place| WorkNote::new(place, running.clone())).collect();
         let wake = Arc::new(eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)?);
         let (results_sender, results) = channel();
         let sender = ResultSender { results: results_sender, wake: Arc::clone(&wake) };
-        let (loads, load_inbox) = channel::<LoadJob>();
-        let (runs, run_inbox) = channel::<WorkerRequest>();
-        let loader = ModelLoader { backends, limits, engines, note: notes[0].clone() };
-        let mut worker = ModelWorker::new(notes[1].clone(), limits.run_max);
         let named = |name: &str| Builder::new().name(name.to_owned()).stack_size(STACK_BYTES);
+        let (loads, load_inbox) = channel::<LoadJob>();
+        let (runs, run_inbox) = channel::<RunJob>();
+        let loader = ModelLoader { backends, limits, engines, note: notes[0].clone() };
         let load_sender = sender.clone();
-        let load_thread = named("loader").spawn(move || {
+        let mut threads = vec![named("loader").spawn(move || {
             for job in load_inbox {
                 if !load_sender.send(ThreadResult::Loaded(loader.load(&job))) {
                     return;
                 }
             }
-        })?;
-        let run_thread = named("worker").spawn(move || {
-            for request in run_inbox {
-                let done = worker.handle(request);
-                if done.is_some_and(|done| !sender.send(ThreadResult::Ran(done))) {
-                    return;
-                }
-            }
-        })?;
-        Ok(Self { loads, runs, results, wake, notes, threads: [load_thread, run_thread] })
+        })?];
+        // An idle thread holds the lock while it waits for a job.
+        let run_inbox = Arc::new(Mutex::new(run_inbox));
+        for note in &notes[1..] {
+            let (inbox, sender) = (Arc::clone(&run_inbox), sender.clone());
+            let worker = ModelWorker::new(note.clone(), limits.run_max);
+            let next = move || inbox.lock().unwrap_or_else(PoisonError::into_inner).recv();
+            threads.push(named("worker").spawn(move || {
+                while let Ok(job) = next()
+                    && sender.send(ThreadResult::Ran(worker.run(&job)))
+                {}
+            })?);
+        }
+        Ok(Self { loads, runs, models: HashMap::new(), results, wake, notes, threads })
     }
 
     pub(crate) fn load(&self, job: LoadJob) {
@@ -95,8 +102,22 @@ impl ModelThreads {
         let _ = self.loads.send(job);
     }
 
-    pub(crate) fn request(&self, request: WorkerRequest) {
-        let _ = self.runs.send(request);
+    pub(crate) fn add_model(&mut self, session: SessionId, model: WorkerModel) {
+        self.models.insert(session, Arc::new(Mutex::new(model)));
+    }
+
+    pub(crate) fn model(&self, session: SessionId) -> Option<SharedModel> {
+        self.models.get(&session).map(Arc::clone)
+    }
+
+    pub(crate) fn remove_model(&mut self, session: SessionId) {
+        let model = self.models.remove(&session);
+        // A large one takes a while to be removed from memory.
+        let _ = Builder::new().spawn(move || drop(model));
+    }
+
+    pub(crate) fn run(&self, job: RunJob) {
+        let _ = self.runs.send(job);
     }
 
     pub(crate) fn wake(&self) -> &OwnedFd {

@@ -1,12 +1,11 @@
-//! The thread that runs models, one after another.
+//! A thread that runs models, one after another.
 //!
 //! It copies inputs out of shared memory before anything reads them, and keeps inputs and outputs
 //! of the last run of each model: the next request with the same bytes is answered with these.
 //! The next inputs take the place of the last: for 5 MB, fresh memory takes longer than the copy.
 
-use std::collections::HashMap;
 use std::io;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use gleaner_protocol::inference::{Element, ModelFault, ModelFaultKind, TensorInfo, TensorPlace};
@@ -18,14 +17,12 @@ use crate::region::TensorRegion;
 use crate::running::{ModelWork, WorkNote};
 use crate::sessions::SessionId;
 
-/// Time after its deadline for which a run may go on that cannot be interrupted.
-const GRACE: Duration = Duration::from_secs(2);
+/// Time after its deadline for which a run may go on that cannot be interrupted. Other models run
+/// beside it.
+const GRACE: Duration = Duration::from_secs(10);
 
-pub(crate) enum WorkerRequest {
-    Add(SessionId, WorkerModel),
-    Remove(SessionId),
-    Run(RunJob),
-}
+/// A loaded model. One thread uses it at a time.
+pub(crate) type SharedModel = Arc<Mutex<WorkerModel>>;
 
 pub(crate) struct WorkerModel {
     pub(crate) graph: Box<dyn LoadedGraph>,
@@ -50,7 +47,9 @@ struct LastResult {
 pub(crate) struct RunJob {
     pub(crate) job: u64,
     pub(crate) session: SessionId,
-    pub(crate) lambda: String,
+    pub(crate) model: SharedModel,
+    /// Identity and name of the lambda.
+    pub(crate) lambda: [String; 2],
     pub(crate) inputs: Vec<PlacedInput>,
     /// Region of the inputs; `None` if there are none.
     pub(crate) input_region: Option<Arc<TensorRegion>>,
@@ -81,50 +80,33 @@ pub(crate) struct RunOutputs {
 
 /// The work of the thread.
 pub(crate) struct ModelWorker {
-    models: HashMap<SessionId, WorkerModel>,
     note: WorkNote,
     run_max: Duration,
 }
 
 impl ModelWorker {
     pub(crate) fn new(note: WorkNote, run_max: Duration) -> Self {
-        Self { models: HashMap::new(), note, run_max }
+        Self { note, run_max }
     }
 
-    /// Handles a request; returns the result of a run.
-    pub(crate) fn handle(&mut self, request: WorkerRequest) -> Option<RunDone> {
-        match request {
-            WorkerRequest::Add(id, model) => {
-                self.models.insert(id, model);
-                None
-            }
-            WorkerRequest::Remove(id) => {
-                self.models.remove(&id);
-                None
-            }
-            WorkerRequest::Run(job) => Some(self.run(job)),
-        }
-    }
-
-    fn run(&mut self, job: RunJob) -> RunDone {
+    pub(crate) fn run(&self, job: &RunJob) -> RunDone {
         let done = |result, ran_ns| RunDone { job: job.job, session: job.session, result, ran_ns };
-        let Some(model) = self.models.get_mut(&job.session) else {
-            return done(Err(failed("the model was removed")), None);
-        };
         if job.stop.is_stopped() {
             return done(Err(failed("nothing waits for the result")), None);
         }
-        // After the deadline only other lambdas wait for its end.
+        // A panic leaves at worst results that are taken before they are read.
+        let mut model = job.model.lock().unwrap_or_else(PoisonError::into_inner);
+        let [id, name] = &job.lambda;
         let limit = job.left.map_or(self.run_max, |left| self.run_max.min(left + GRACE));
         self.note.begin(ModelWork {
-            sha256: model.sha256.clone(),
+            note: format!("{} {id}", model.sha256),
             path: model.path.clone(),
-            lambdas: vec![job.lambda.clone()],
+            lambdas: vec![name.clone()],
             until: Instant::now() + limit,
             limit,
             stop: Arc::clone(&job.stop),
         });
-        let (result, ran_ns) = model.run(&job);
+        let (result, ran_ns) = model.run(job);
         self.note.end();
         done(result, ran_ns)
     }
@@ -255,7 +237,6 @@ fn read_changes(region: &TensorRegion, input: &PlacedInput, known: &mut [u8]) ->
 mod tests {
     use super::*;
     use crate::backend::BackendError;
-    use crate::running::WorkKind;
     use crate::sessions::{SessionKey, SessionTable};
 
     /// Returns its input, and panics for a first byte of 255.
@@ -275,13 +256,14 @@ mod tests {
     struct Bench {
         worker: ModelWorker,
         session: SessionId,
+        model: SharedModel,
         region: Arc<TensorRegion>,
         outputs: Option<Arc<TensorRegion>>,
     }
 
     fn bench(element: Element) -> Bench {
-        let note = WorkNote::new(WorkKind::Run, None);
-        let mut worker = ModelWorker::new(note, Duration::from_secs(60));
+        let note = WorkNote::new(1, None);
+        let worker = ModelWorker::new(note, Duration::from_secs(60));
         let key = SessionKey { sha256: "0".repeat(64), providers: Vec::new(), threads: 1 };
         let session = SessionTable::default().add(key.clone(), String::new());
         let info = TensorInfo { name: "y".to_owned(), element, shape: vec![None] };
@@ -292,9 +274,9 @@ mod tests {
             outputs: vec![info],
             last: LastRun::default(),
         };
-        worker.handle(WorkerRequest::Add(session, model));
+        let model = Arc::new(Mutex::new(model));
         let region = Arc::new(TensorRegion::create("test", 8192).unwrap());
-        Bench { worker, session, region, outputs: None }
+        Bench { worker, session, model, region, outputs: None }
     }
 
     impl Bench {
@@ -305,7 +287,8 @@ mod tests {
             let job = RunJob {
                 job: 1,
                 session: self.session,
-                lambda: "test".to_owned(),
+                model: Arc::clone(&self.model),
+                lambda: ["test".to_owned(), "test".to_owned()],
                 inputs: vec![input],
                 input_region: Some(Arc::clone(&self.region)),
                 output_region: self.outputs.clone(),
@@ -313,7 +296,7 @@ mod tests {
                 left: None,
                 stop: Arc::default(),
             };
-            self.worker.handle(WorkerRequest::Run(job)).unwrap()
+            self.worker.run(&job)
         }
     }
 

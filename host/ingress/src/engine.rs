@@ -79,6 +79,9 @@ impl Ingress {
     ///
     /// Errors of waiting for sockets, which need a kernel without memory.
     pub fn run(mut self, control: IngressServer, stop: Option<OwnedFd>) -> std::io::Result<()> {
+        if let Some(joined) = self.source.joined() {
+            (self.reports)(IngressReport::Joined(joined));
+        }
         (self.reports)(IngressReport::Ready);
         let mut control = control;
         let end = self.serve(&mut control, stop.as_ref())?;

@@ -4,6 +4,7 @@
 //! - `engine`: the loop: one thread that owns the source, the readers and the topics.
 //! - `reader`, `publish_rate`: a connected reader, and the limit of what it may publish.
 //! - `topics`, `topic`: the topics that have readers, and their subscriptions.
+//! - `rate_watch`: notices a topic that receives far fewer samples than before.
 //! - `sink`, `sizes`: the memory of a topic, which the thread of the source writes.
 //! - [`program`]: the program `gleaner-ingress`.
 //!
@@ -13,6 +14,7 @@
 mod engine;
 pub mod program;
 mod publish_rate;
+mod rate_watch;
 mod reader;
 mod sink;
 mod sizes;

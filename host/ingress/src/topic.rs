@@ -11,6 +11,7 @@ use gleaner_transport::{
 };
 use tracing::{info, warn};
 
+use crate::rate_watch::RateWatch;
 use crate::sink::{
     AttachRequest, AttachedReader, RegionId, RegionWriter, SubscriptionSink, TopicSink,
 };
@@ -19,6 +20,9 @@ use crate::sizes::RegionSizes;
 /// Time for which a topic has two subscriptions once the second one has received a sample: the
 /// second may find some writers later than others.
 const OVERLAP: Duration = Duration::from_secs(3);
+
+/// Most warnings in the status of a topic.
+const MOST_WARNINGS: usize = 16;
 
 /// A topic with one subscription, or with two while one takes over from the other.
 pub(crate) struct SharedTopic {
@@ -36,6 +40,7 @@ pub(crate) struct SharedTopic {
     /// The file and the reserved bytes of each region.
     regions: Vec<(RegionId, OwnedFd, u64)>,
     readers: usize,
+    rate: RateWatch,
     pub(crate) status: ReceptionStatus,
 }
 
@@ -58,6 +63,7 @@ impl SharedTopic {
             has_earlier: false,
             regions: Vec::new(),
             readers: 0,
+            rate: RateWatch::default(),
             status: ReceptionStatus::default(),
         }
     }
@@ -109,7 +115,7 @@ impl SharedTopic {
             info!(topic = self.spec.topic, type_name = self.spec.type_name, "subscribed");
             return Ok(());
         };
-        if wanted.max_bytes <= self.spec.max_bytes && wanted.queue <= self.spec.queue {
+        if source.suffices(&self.spec, wanted) {
             return Ok(());
         }
         let spec = TopicSpec {
@@ -233,6 +239,11 @@ impl SharedTopic {
             // What a later one did not receive before its match, an earlier one did.
             status.before_match = self.earlier.before_match;
         }
+        let counts = (self.sink.counts().received, status.writers);
+        let warning = self.rate.note(&self.spec.topic, counts, Instant::now());
+        // First, so that others leave it its place.
+        status.qos_warnings.splice(..0, warning);
+        status.qos_warnings.truncate(MOST_WARNINGS);
         self.sink.set_lost(status.lost);
         self.status = status;
     }

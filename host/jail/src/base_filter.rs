@@ -10,9 +10,12 @@ use rustix::thread::{
 
 use crate::JailError;
 use crate::filter::{DeniedCalls, install};
+use crate::priority::leave_real_time;
 
 /// The name of this layer.
 pub const NAME: &str = "system calls";
+/// The name of the layer of a process that has to keep the priority of its starter.
+const REAL_TIME: &str = "real-time priority";
 
 /// Flags of `clone` that create namespaces, in which a process would gain privileges.
 const NAMESPACES: [i32; 7] = [
@@ -107,8 +110,15 @@ const MACHINE_CALLS: &[i64] =
 #[cfg(not(target_arch = "x86_64"))]
 const MACHINE_CALLS: &[i64] = &[];
 
-/// Applies these limits to this process and its descendants. Returns the layers that hold.
+/// Applies these limits to this process, which has one thread, and its descendants. Returns the
+/// layers; that of real-time priority only if this process has to keep it.
 pub fn apply() -> Vec<Layer> {
+    let kept = leave_real_time().err().map(|error| Layer::no(REAL_TIME, error.to_string()));
+    kept.into_iter().chain(apply_at_any_priority()).collect()
+}
+
+/// As [`apply`], for a process that may have real-time priority.
+pub(crate) fn apply_at_any_priority() -> Vec<Layer> {
     forbid_real_time();
     vec![
         no_new_privileges(),
@@ -119,8 +129,8 @@ pub fn apply() -> Vec<Layer> {
     ]
 }
 
-/// Forbids real-time priority, which the starter may have for the ingress: a lambda that has it
-/// would take a core from everyone else.
+/// Forbids to take real-time priority, which the starter may have for the ingress: a lambda that
+/// has it would take a core from everyone else.
 fn forbid_real_time() {
     // Lowering a limit is never refused.
     let _ = setrlimit(Resource::Rtprio, Rlimit { current: Some(0), maximum: Some(0) });

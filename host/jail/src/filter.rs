@@ -3,7 +3,6 @@
 use std::collections::BTreeMap;
 use std::ops::Range;
 
-use rustix::thread::{SecureComputingMode, secure_computing_mode};
 use seccompiler::{
     BpfProgram, SeccompAction, SeccompCmpArgLen, SeccompCmpOp, SeccompCondition, SeccompFilter,
     SeccompRule, TargetArch,
@@ -119,10 +118,11 @@ pub(crate) fn install(filter: &BpfProgram) -> Result<(), JailError> {
 }
 
 /// Installs `filter` for all threads of this process and their descendants. Fails with
-/// [`JailError::ExistingThread`] where filters work on this system, but a thread cannot get this
-/// one, since its filters differ from those of this thread.
+/// [`JailError::ExistingThread`] if a thread cannot get this one, since its filters differ from
+/// those of this thread.
 pub(crate) fn install_everywhere(filter: &BpfProgram) -> Result<(), JailError> {
-    let works = matches!(secure_computing_mode(), Ok(SecureComputingMode::Filter));
-    let error = if works { JailError::ExistingThread } else { JailError::Install };
-    seccompiler::apply_filter_all_threads(filter).map_err(error)
+    seccompiler::apply_filter_all_threads(filter).map_err(|error| match error {
+        seccompiler::Error::ThreadSync(_) => JailError::ExistingThread(error),
+        error => JailError::Install(error),
+    })
 }

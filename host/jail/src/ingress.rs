@@ -22,9 +22,13 @@ pub enum NewSockets {
 
 /// Restricts this process, which has one thread, to `paths` and the system's programs and
 /// libraries, and hides its memory from other processes. Call it first in `main`: threads that
-/// exist already would keep their privileges. Returns the layers, for [`close`].
-pub fn start(paths: &Paths) -> Vec<Layer> {
-    let mut layers = base_filter::apply();
+/// exist already would keep their privileges. One that `has_real_time` priority, since it was
+/// requested, keeps it. Returns the layers, for [`close`].
+pub fn start(paths: &Paths, has_real_time: bool) -> Vec<Layer> {
+    let mut layers = match has_real_time {
+        true => base_filter::apply_at_any_priority(),
+        false => base_filter::apply(),
+    };
     // Each reader and each region has one.
     gleaner_base::raise_open_files();
     layers.push(own_memory::hide());

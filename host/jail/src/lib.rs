@@ -14,9 +14,10 @@
 //!
 //! [`self_test`] then tries what should be denied: a layer counts only if it was seen to deny it.
 //! [`cgroup`] is the supervisor's side, for memory and processes that a lambda starts. A layer that
-//! the system lacks is reported and not fatal: a lambda runs with the layers that exist, and users
-//! can read which these are. A layer that the system has but that something in the process prevents
-//! is fatal.
+//! the system lacks is reported, and users can read which layers exist. Without one of
+//! [`REQUIRED_LAYERS`](gleaner_protocol::REQUIRED_LAYERS), `gleaner-shim` starts no lambda; without
+//! another one, a lambda runs. A layer that the system has but that something in the process
+//! prevents is fatal.
 
 pub mod base_filter;
 pub mod cgroup;
@@ -28,6 +29,7 @@ pub mod inference;
 pub mod ingress;
 pub mod memory;
 mod own_memory;
+pub mod priority;
 pub mod recorder;
 pub mod sandbox_filter;
 pub mod self_test;
@@ -59,8 +61,12 @@ impl JailError {
         let mut text = self.to_string();
         let mut source = std::error::Error::source(self);
         while let Some(cause) = source {
-            text.push_str(": ");
-            text.push_str(&cause.to_string());
+            let why = cause.to_string();
+            // An error of the filter's library ends with its own cause.
+            if !text.ends_with(&why) {
+                text.push_str(": ");
+                text.push_str(&why);
+            }
             source = cause.source();
         }
         text

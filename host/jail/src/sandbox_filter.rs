@@ -5,6 +5,7 @@
 //! this once its topics are open, and before the lambda is loaded.
 
 use gleaner_protocol::Layer;
+use rustix::thread::{SecureComputingMode, secure_computing_mode};
 
 use crate::filter::{ALL, DeniedCalls, install, install_everywhere};
 use crate::{JailError, base_filter, memory, sockets};
@@ -181,10 +182,20 @@ pub fn apply(only_counted_memory: bool) -> Result<Vec<Layer>, JailError> {
             ),
         ],
         Err(error @ JailError::ExistingThread(_)) => return Err(error),
-        Err(error) => [PROCESSES, sockets::NAME, SHARED_RESOURCES]
-            .map(|name| Layer::no(name, error.chain()))
-            .to_vec(),
+        // An interpreter has run code of its environment, which may have denied the call itself.
+        Err(JailError::Install(error))
+            if only_counted_memory
+                && matches!(secure_computing_mode(), Ok(SecureComputingMode::Filter)) =>
+        {
+            return Err(JailError::ExistingThread(error));
+        }
+        Err(error) => missing(&error),
     })
+}
+
+/// Returns the layers of [`apply`], none of which holds for this reason.
+pub fn missing(error: &JailError) -> Vec<Layer> {
+    [PROCESSES, sockets::NAME, SHARED_RESOURCES].map(|name| Layer::no(name, error.chain())).to_vec()
 }
 
 fn install_all(only_counted_memory: bool) -> Result<(), JailError> {

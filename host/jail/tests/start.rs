@@ -135,6 +135,24 @@ fn no_process_takes_real_time_priority() {
 }
 
 #[test]
+fn no_process_keeps_the_real_time_priority_of_its_starter() {
+    in_own_process("no_process_keeps_the_real_time_priority_of_its_starter", || {
+        let priority = libc::sched_param { sched_priority: 1 };
+        // SAFETY: the call reads `priority`, which lives until it returns.
+        if unsafe { libc::sched_setscheduler(0, libc::SCHED_FIFO, &raw const priority) } != 0 {
+            println!("skipped, no real-time priority: {}", Error::last_os_error());
+            return;
+        }
+        // SAFETY: the call takes a number by value; 0 is the calling thread.
+        let policy = || unsafe { libc::sched_getscheduler(0) };
+        ingress::start(&Paths::default(), true);
+        assert_eq!(policy(), libc::SCHED_FIFO, "it was requested");
+        assert!(!base_filter::apply().iter().any(|layer| layer.name == "real-time priority"));
+        assert_eq!(policy(), libc::SCHED_OTHER);
+    });
+}
+
+#[test]
 fn memory_in_use_does_not_raise_a_limit_above_an_earlier_one() {
     in_own_process("memory_in_use_does_not_raise_a_limit_above_an_earlier_one", || {
         let bound = || getrlimit(Resource::Data).maximum.unwrap();
@@ -189,7 +207,7 @@ fn the_ingress_has_datagrams_memory_and_threads_but_no_programs_and_streams() {
         || {
             let drive = std::env::current_exe().unwrap();
             let paths = Paths { read: vec![drive.clone()], write: Vec::new() };
-            let layers = ingress::start(&paths);
+            let layers = ingress::start(&paths, false);
             // A thread from before, as those of DDS.
             let (go, goes) = mpsc::channel::<()>();
             let earlier = thread::spawn(move || {
@@ -218,7 +236,7 @@ fn the_ingress_has_datagrams_memory_and_threads_but_no_programs_and_streams() {
 #[test]
 fn an_ingress_that_plays_a_drive_has_no_sockets() {
     in_own_process("an_ingress_that_plays_a_drive_has_no_sockets", || {
-        let layers = ingress::start(&Paths::default());
+        let layers = ingress::start(&Paths::default(), false);
         hold(&ingress::close(layers, NewSockets::None).unwrap());
         refused(UdpSocket::bind("127.0.0.1:0"));
     });

@@ -25,7 +25,6 @@ pub struct Definitions {
 
 #[derive(Debug)]
 pub(super) struct Struct {
-    /// `pkg/Type`.
     pub(super) name: String,
     pub(super) fields: Vec<FieldDefinition<usize>>,
     pub(super) layout: Layout,
@@ -170,7 +169,6 @@ impl Definitions {
         self.structs.last().expect("parse resolves the root or fails, and pushes it last")
     }
 
-    /// Returns the type that a resolved field refers to.
     pub(super) fn get(&self, index: usize) -> &Struct {
         &self.structs[index]
     }

@@ -11,7 +11,6 @@ use super::parse::Primitive;
 pub(super) struct SkipTable([u32; 8]);
 
 impl SkipTable {
-    /// A value of no bytes.
     pub(super) const EMPTY: Self = Self([0; 8]);
 
     pub(super) fn primitive(primitive: Primitive) -> Self {

@@ -34,7 +34,6 @@ impl Primitive {
     }
 }
 
-/// Number of elements of a field.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub(super) enum Count {
     One,

@@ -5,7 +5,6 @@ use super::layout::SkipTable;
 use super::parse::{Count, Primitive};
 use super::value::{MessageValue, ValueKind};
 
-/// One step towards the field.
 #[derive(Debug)]
 pub(super) enum Op {
     /// Any run of fixed-size fields.
@@ -25,7 +24,6 @@ pub(super) enum Op {
     Enter { index: usize, least: usize },
 }
 
-/// The element at the end of the path.
 #[derive(Copy, Clone, Debug)]
 pub(super) enum Leaf {
     Scalar(Primitive),

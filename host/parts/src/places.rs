@@ -2,7 +2,6 @@ use std::path::{Path, PathBuf};
 
 use super::PartsError;
 
-/// The folders that may contain parts.
 #[derive(Debug, Clone)]
 pub(super) struct Places {
     /// In search order.

@@ -75,7 +75,6 @@ fn linked(candidate: &Path, lambda_dir: &Path) -> Result<PathBuf, String> {
 
 /// Advice if an environment cannot be used.
 const CREATE_VENV: &str = "create the environment with `python3 -m venv`, which uses links";
-/// The configuration file of an environment.
 const CONFIG: &str = "pyvenv.cfg";
 /// Maximum size of `pyvenv.cfg`. `python3 -m venv` writes 200 bytes.
 const CONFIG_MAX: ByteSize = ByteSize::mib(1);
@@ -131,7 +130,6 @@ fn environment_of(candidate: &Path) -> &Path {
     candidate.parent().and_then(Path::parent).unwrap_or(candidate)
 }
 
-/// Reads `pyvenv.cfg` of that environment.
 fn config_of(candidate: &Path) -> io::Result<String> {
     let config = PlainFile::inside(environment_of(candidate), Path::new(CONFIG), CONFIG_MAX)?
         .read_whole()?;

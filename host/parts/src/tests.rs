@@ -258,13 +258,6 @@ fn gleaner_home_must_have_a_part() {
 }
 
 #[test]
-fn the_pythons_of_path_are_tried_last_and_newest_first() {
-    let names = python::candidates(None, None);
-    let expected = ["python3", "python3.13", "python3.12", "python3.11", "python3.10", "python3.9"];
-    assert_eq!(names, expected.map(PathBuf::from));
-}
-
-#[test]
 fn without_a_working_python_each_candidate_is_named_with_its_error() {
     let _lock = EXEC_LOCK.lock().unwrap_or_else(PoisonError::into_inner);
     let dir = TestFolder::new();

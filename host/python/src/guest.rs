@@ -1,14 +1,16 @@
 //! Runs a Python lambda as a guest of the host. `start.py` hands over the interpreter by calling
 //! `main`.
 
+use std::cell::Cell;
 use std::ffi::OsString;
 use std::path::{self, PathBuf};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use gleaner_host::api::Session;
+use gleaner_host::api::call_time::{CallTime, TimeUsed};
 use gleaner_host::api::data::Wake;
 use gleaner_host::api::log::LINE_BYTES;
-use gleaner_host::guest::{Guest, LambdaEngine, WakeOutcome, is_late};
+use gleaner_host::guest::{Guest, LambdaEngine, WakeOutcome};
 use gleaner_host::session_setup::RunMode;
 use gleaner_host::{memory, program};
 use gleaner_lambda::manifest::{Limits, Manifest, ScheduleSpec};
@@ -38,6 +40,18 @@ pub(crate) fn main(py: Python<'_>, args: Vec<OsString>, host: Py<PyAny>) -> u8 {
             Ok(Box::new(PythonGuest::new(host, entry, handler(manifest), session, allowed)))
         })
     })
+}
+
+thread_local! {
+    /// The current call into the lambda, if it has a deadline.
+    static CALL: Cell<Option<CallTime>> = const { Cell::new(None) };
+}
+
+/// Time in seconds that is left of the current call into the lambda; 0 if it has to end. The
+/// signal handler of the deadline calls this.
+#[pyfunction]
+pub(crate) fn time_left() -> f64 {
+    CALL.get().map_or(0.0, |call| call.left(Duration::ZERO).as_secs_f64())
 }
 
 fn handler(manifest: &Manifest) -> &'static str {
@@ -170,22 +184,24 @@ impl PythonGuest {
         allowed: Duration,
         call: impl PyCallArgs<'py>,
     ) -> Result<Bound<'py, PyAny>, CallFault> {
-        let started = Instant::now();
-        self.session.models().end_at((!allowed.is_zero()).then(|| started + allowed));
+        let time = (!allowed.is_zero()).then(|| CallTime::begin(allowed));
+        CALL.set(time);
+        self.session.models().end_with(time);
         let ended = self.host.bind(py).call_method1(intern!(py, "attempt"), call)?;
-        let elapsed = started.elapsed();
+        let late = time.as_ref().and_then(CallTime::late);
         match ended
             .extract::<(Bound<'py, PyAny>, Option<Bound<'py, PyString>>, Bound<'py, PyString>)>()?
         {
             // The signal never came: a lambda can ignore it, block it, or disable its timer.
-            (_, None, _) if !allowed.is_zero() && is_late(elapsed, allowed) => {
-                Err(CallFault::late("native code of Python is not interrupted", elapsed, allowed))
-            }
-            (result, None, _) => Ok(result),
+            (result, None, _) => late.map_or(Ok(result), |time| {
+                Err(CallFault::late("native code of Python is not interrupted", time))
+            }),
             (_, Some(message), kind) => {
                 let message = message.to_string_lossy().into_owned();
                 Err(match &*kind.to_string_lossy() {
-                    "deadline" => CallFault::late(&message, elapsed, allowed),
+                    "deadline" => {
+                        CallFault::late(&message, time.map(|time| time.used()).unwrap_or_default())
+                    }
                     "memory" => CallFault {
                         kind: FaultKind::Memory,
                         message,
@@ -227,12 +243,9 @@ impl CallFault {
     }
 
     /// Creates a deadline fault; `location` is the place where the call was interrupted.
-    fn late(location: &str, ran: Duration, allowed: Duration) -> Self {
-        let ms = |time: Duration| time.as_secs_f64() * 1e3;
-        let message =
-            format!("{location}\nran {:.1} ms; the deadline is {:.1} ms", ms(ran), ms(allowed));
-        let ns = |time: Duration| u64::try_from(time.as_nanos()).ok();
-        Self { kind: FaultKind::Deadline, message, used: ns(ran), allowed: ns(allowed) }
+    fn late(location: &str, time: TimeUsed) -> Self {
+        let Fault { kind, message, used, allowed } = time.fault(&format!("{location}\n"));
+        Self { kind, message, used, allowed }
     }
 }
 

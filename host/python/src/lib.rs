@@ -36,7 +36,7 @@ mod _gleaner {
     #[pymodule_export]
     use super::frame::Frame;
     #[pymodule_export]
-    use super::guest::main;
+    use super::guest::{main, time_left};
     #[pymodule_export]
     use super::inference::{Model, Tensor};
     #[pymodule_export]

@@ -201,7 +201,6 @@ mod tests {
         assert_eq!(fcntl_add_seals(file, SealFlags::WRITE), Err(Errno::PERM));
     }
 
-    /// Bytes of the file that are in memory.
     fn present(file: &File) -> i64 {
         rustix::fs::fstat(file).unwrap().st_blocks * 512
     }

@@ -52,7 +52,6 @@ fn main() -> ExitCode {
     ExitCode::SUCCESS
 }
 
-/// A topic and the processes that read it.
 struct Topic {
     region: File,
     writer: SharedWriter,
@@ -99,7 +98,6 @@ impl Topic {
         ReaderProcess { child, stdout, id }
     }
 
-    /// Publishes a sample each word of which is `word`.
     fn publish(&mut self, word: u64) {
         let len = 8 * (1 + self.writer.head() as usize % 512);
         let mut draft = self.writer.draft(len).unwrap();

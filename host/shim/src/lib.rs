@@ -31,7 +31,9 @@ use clap::Parser;
 use gleaner_base::{ByteSize, Exit, Failure};
 use gleaner_jail::cgroup::{CgroupLimits, Group};
 use gleaner_jail::{Paths, base_filter, cgroup, files, memory, sandbox_filter, self_test, sockets};
-use gleaner_protocol::{ExitRecord, LAYERS_ENV, Layer, ProcessOrigin, RESULTS_ENV, SHIM_ENV};
+use gleaner_protocol::{
+    ExitRecord, LAYERS_ENV, Layer, ProcessOrigin, REQUIRED_HELP, RESULTS_ENV, SHIM_ENV,
+};
 use gleaner_vitals::{PULSE_ENV, Pulse, make_inheritable};
 
 use self::results::{BUDGET, ResultFiles, ResultSpool, Results};
@@ -152,6 +154,7 @@ fn run(args: &Args) -> Result<ExitCode, Failure> {
     layers.extend([sockets::deny(), hard_deadline()]);
     let (group, layer) = create_cgroup(args);
     layers.push(layer);
+    refuse_without_required(&layers)?;
     let layers = serde_json::to_string(&layers).expect("layers are plain data");
     let (program, arguments) = args.program.split_first().expect("clap requires a program");
     let mut command = Command::new(program);
@@ -269,6 +272,14 @@ fn exit_like(record: &ExitRecord) -> ExitCode {
     u8::try_from(record.code.unwrap_or(1)).unwrap_or(1).into()
 }
 
+/// Returns a failure if no lambda may run, as one of `layers` is missing.
+fn refuse_without_required(layers: &[Layer]) -> Result<(), Failure> {
+    let Some(missing) = layers.iter().find(|layer| layer.prevents_lambdas()) else { return Ok(()) };
+    let message = format!("this machine cannot sandbox a lambda: `{}` does not hold", missing.name);
+    let failure = Failure::new(Exit::Internal, message);
+    Err(Failure { causes: vec![missing.note.clone()], ..failure }.with_help(REQUIRED_HELP))
+}
+
 fn hard_deadline() -> Layer {
     Layer::yes(HARD_DEADLINE, "gleaner-shim kills a runtime that misses its deadline")
 }
@@ -299,8 +310,8 @@ fn show_layers(args: &Args) -> Result<ExitCode, Failure> {
     layers.push(files::confine(&Paths::default()));
     layers.push(sandbox_filter::apply_before_interpreter(true));
     layers.push(memory::limit(64 << 20));
-    let cannot = |error| Failure::caused_by(Exit::Internal, "cannot set up the layers", &error);
-    let denied = sandbox_filter::apply(true).map_err(cannot)?;
+    let denied =
+        sandbox_filter::apply(true).unwrap_or_else(|error| sandbox_filter::missing(&error));
     layers.extend(denied.into_iter().filter(|layer| layer.name != sockets::NAME));
     let layers = self_test::verify(layers);
     println!("{}", serde_json::to_string(&layers).expect("layers are plain data"));

@@ -1,4 +1,4 @@
-//! Forwards signals to the runtime, and reads the clock.
+//! Forwards signals to the runtime, notices that of its end, and reads the clock.
 
 use std::io::{self, Read};
 use std::os::fd::{AsFd, BorrowedFd};
@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use rustix::process::{Signal, getpid, kill_process};
 use rustix::time::{ClockId, clock_gettime};
-use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM};
+use signal_hook::consts::{SIGCHLD, SIGHUP, SIGINT, SIGQUIT, SIGTERM};
 
 /// Signals that the shim forwards to the runtime.
 const FORWARDED: [(i32, Signal); 4] = [
@@ -20,7 +20,7 @@ const FORWARDED: [(i32, Signal); 4] = [
 
 /// Signals received and not yet forwarded.
 pub(crate) struct Signals {
-    /// Becomes readable when a signal is received.
+    /// Becomes readable when a signal is received, or SIGCHLD at the end of a child.
     notified: UnixStream,
     received: [Arc<AtomicBool>; FORWARDED.len()],
 }
@@ -36,6 +36,8 @@ impl Signals {
             signal_hook::flag::register(*number, Arc::clone(received))?;
             signal_hook::low_level::pipe::register(*number, notifier.try_clone()?)?;
         }
+        // A handle of the process would need `pidfd_open`, which containers refuse.
+        signal_hook::low_level::pipe::register(SIGCHLD, notifier)?;
         Ok(Self { notified, received })
     }
 

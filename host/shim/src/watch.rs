@@ -11,7 +11,7 @@ use gleaner_vitals::Pulse;
 use nix::sys::resource::{UsageWho, getrusage};
 use nix::sys::time::TimeValLike;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
-use rustix::process::{Pid, PidfdFlags, Signal, kill_process, pidfd_open};
+use rustix::process::{Pid, Signal, kill_process};
 
 use crate::health_check::HealthCheck;
 use crate::signals::{Signals, time_of_day_ns};
@@ -44,7 +44,6 @@ impl RunningProcess {
     /// finds a reason, or if it has not ended [`SHUTDOWN_TIMEOUT`] after the first signal.
     pub(crate) fn wait(mut self) -> io::Result<ProcessEnd> {
         let pid = Pid::from_child(&self.child);
-        let process = pidfd_open(pid, PidfdFlags::empty())?;
         let mut killed = None;
         let mut health = HealthCheck::of(self.child.id());
         let mut end_requested_at: Option<Instant> = None;
@@ -64,11 +63,8 @@ impl RunningProcess {
                 tv_sec: timeout.as_secs().cast_signed(),
                 tv_nsec: i64::from(timeout.subsec_nanos()),
             };
-            let mut ready = [
-                PollFd::new(&process, PollFlags::IN),
-                PollFd::from_borrowed_fd(self.signals.as_fd(), PollFlags::IN),
-            ];
-            match poll(&mut ready, Some(&timeout)) {
+            let signals = PollFd::from_borrowed_fd(self.signals.as_fd(), PollFlags::IN);
+            match poll(&mut [signals], Some(&timeout)) {
                 Ok(_) | Err(rustix::io::Errno::INTR) => {}
                 Err(error) => return Err(error.into()),
             }

@@ -1,13 +1,13 @@
 //! Limits of one call of a lambda: bytes, items, fuel and time. Neither fuel nor a deadline
 //! interrupts a call from outside.
 
-use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use gleaner_lambda::manifest::Limits;
 use gleaner_rules::clamps;
 
+use super::call_time::CallTime;
 use super::error::DataError;
 use super::fuel::{Fuel, OutOfFuel};
 use super::shared_bytes::SharedBytes;
@@ -66,43 +66,27 @@ impl PerCall {
     }
 }
 
-/// Value of [`DueTime::at`] without a deadline.
-const NEVER: u64 = 0;
-
 /// Time at which the current call into the lambda has to end; long operations check it regularly. A
 /// replay has none.
-#[derive(Clone)]
-pub struct Due(Arc<DueTime>);
-
-struct DueTime {
-    base: Instant,
-    /// Due time in ns since `base`.
-    at: AtomicU64,
-}
-
-impl Default for Due {
-    fn default() -> Self {
-        Self(Arc::new(DueTime { base: Instant::now(), at: AtomicU64::new(NEVER) }))
-    }
-}
+#[derive(Clone, Default)]
+pub struct Due(Arc<Mutex<Option<CallTime>>>);
 
 impl Due {
-    /// Sets the due time; `None` for no deadline.
-    pub fn set(&self, at: Option<Instant>) {
-        let since = |at: Instant| {
-            at.saturating_duration_since(self.0.base).max(Duration::from_nanos(NEVER + 1))
-        };
-        let ns = at.map_or(NEVER, |at| u64::try_from(since(at).as_nanos()).unwrap_or(u64::MAX));
-        self.0.at.store(ns, Ordering::Relaxed);
+    /// Sets the current call; `None` for no deadline.
+    pub fn set(&self, call: Option<CallTime>) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = call;
     }
 
-    /// Returns the due time; `None` without a deadline.
+    fn call(&self) -> Option<CallTime> {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Returns the time at which a call that only waits has to end; `None` without a deadline.
     pub(super) fn at(&self) -> Option<Instant> {
-        let at = self.0.at.load(Ordering::Relaxed);
-        (at != NEVER).then(|| self.0.base + Duration::from_nanos(at))
+        self.call().map(|call| call.end())
     }
 
-    /// Returns an error if the due time has passed.
+    /// Returns an error if the call has to end.
     pub(super) fn check(&self) -> Result<(), DataError> {
         self.allows(0, 1)
     }
@@ -111,12 +95,9 @@ impl Due {
     /// be interrupted. `fastest` is the speed of the fastest machine in bytes per microsecond, so
     /// the deadline is exceeded at most by the factor by which this machine is slower.
     pub(super) fn allows(&self, bytes: usize, fastest: u64) -> Result<(), DataError> {
-        let at = self.0.at.load(Ordering::Relaxed);
-        if at == NEVER {
-            return Ok(());
-        }
-        let left = Duration::from_nanos(at).saturating_sub(self.0.base.elapsed());
+        let Some(call) = self.call() else { return Ok(()) };
         let needed = Duration::from_micros(bytes as u64 / fastest);
+        let left = call.left(needed);
         if left.is_zero() || needed > left { Err(DataError::OutOfTime) } else { Ok(()) }
     }
 }
@@ -125,16 +106,18 @@ impl Due {
 mod tests {
     use super::*;
 
+    fn begun(seconds: u64) -> Option<CallTime> {
+        Some(CallTime::begin(Duration::from_secs(seconds)))
+    }
+
     #[test]
-    fn a_due_time_in_the_past_is_over_and_no_due_time_is_not() {
+    fn a_call_without_time_is_over_and_one_without_a_deadline_is_not() {
         let due = Due::default();
         assert!(due.check().is_ok());
-        due.set(Some(Instant::now() + Duration::from_secs(3600)));
+        due.set(begun(3600));
         assert!(due.check().is_ok());
-        for past in [Instant::now(), due.0.base] {
-            due.set(Some(past));
-            assert!(matches!(due.check(), Err(DataError::OutOfTime)));
-        }
+        due.set(begun(0));
+        assert!(matches!(due.check(), Err(DataError::OutOfTime)));
         due.set(None);
         assert!(due.check().is_ok() && due.allows(usize::MAX, 1).is_ok());
     }
@@ -142,7 +125,7 @@ mod tests {
     #[test]
     fn work_that_cannot_end_in_time_does_not_begin() {
         let due = Due::default();
-        due.set(Some(Instant::now() + Duration::from_secs(3600)));
+        due.set(begun(3600));
         assert!(due.allows(3_000_000_000, 1).is_ok());
         assert!(due.allows(4_000_000_000, 1).is_err() && due.allows(4_000_000_000, 2).is_ok());
     }

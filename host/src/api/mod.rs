@@ -5,11 +5,12 @@
 //! errors, and decide nothing. This room depends on neither.
 //!
 //! So each call does three things here. It is charged ([`fuel`]), before its work if the work is
-//! known by then. Long work checks the deadline as it proceeds (`call`). And an error names its
-//! case in the WIT (`kind`). A call that only reads a value has the base price, which a skin
-//! charges when it resolves the handle.
+//! known by then. Long work checks the deadline as it proceeds (`call`, by the rule of
+//! [`call_time`]). And an error names its case in the WIT (`kind`). A call that only reads a value
+//! has the base price, which a skin charges when it resolves the handle.
 
 mod call;
+pub mod call_time;
 pub mod curves;
 pub mod data;
 mod error;

@@ -157,7 +157,7 @@ impl Models {
             let known: Vec<_> = state.entries.iter().map(|entry| &*entry.name).collect();
             InferenceError::no_such_model(name, &known)
         })?;
-        Ok((entry, state.open(name, &self.time.earliest(due))?))
+        Ok((entry, state.open(name, self.time.earliest(due).at())?))
     }
 
     pub(super) fn run(
@@ -232,11 +232,9 @@ impl ModelsState {
         timeout: Duration,
         latest: Instant,
     ) -> Result<Arc<OpenedModel>, InferenceError> {
-        let due = Due::default();
         let mut began_late = false;
         loop {
-            due.set(Some(Instant::now() + timeout));
-            match self.open(name, &due) {
+            match self.open(name, Some(Instant::now() + timeout)) {
                 Err(InferenceError::Queued(reason)) if Instant::now() < latest => {
                     tracing::warn!(reason, "a model waits for its load");
                     began_late = true;
@@ -248,10 +246,12 @@ impl ModelsState {
         }
     }
 
-    fn open(&mut self, name: &str, due: &Due) -> Result<Arc<OpenedModel>, InferenceError> {
-        let until = due.at();
-        let connection = self.connection.as_mut().ok_or_else(not_connected)?;
-        connection.open(name, until)
+    fn open(
+        &mut self,
+        name: &str,
+        until: Option<Instant>,
+    ) -> Result<Arc<OpenedModel>, InferenceError> {
+        self.connection.as_mut().ok_or_else(not_connected)?.open(name, until)
     }
 
     fn run(

@@ -16,7 +16,6 @@ pub mod worker;
 
 use std::fmt;
 use std::sync::Arc;
-use std::time::Duration;
 
 use gleaner_base::Failure;
 use gleaner_lambda::Fault;
@@ -27,14 +26,6 @@ use serde::{Deserialize, Serialize};
 
 use crate::api::curves::Curves;
 use crate::api::data::{Counts, Topic, Wake};
-
-/// Returns whether a call that took `elapsed` exceeded its deadline `allowed`, although it returned
-/// before it was interrupted. The time is wall time, so it includes the time of other processes.
-pub fn is_late(elapsed: Duration, allowed: Duration) -> bool {
-    /// Delay with which an interruption may take effect.
-    const TOLERANCE: Duration = Duration::from_millis(2);
-    elapsed > allowed.saturating_add(TOLERANCE)
-}
 
 /// The engine of a lambda, on which alone its decisions are reproducible. Its text has all parts,
 /// with a semicolon between them.

@@ -10,6 +10,7 @@ use gleaner_protocol::{Layer, Phase};
 
 use super::meter::Meter;
 use super::{Guest, LambdaEngine, WakeOutcome};
+use crate::api::call_time::WALL_FACTOR;
 use crate::api::data::Wake;
 use crate::api::models::Models;
 use crate::isolation::Isolation;
@@ -28,7 +29,8 @@ impl KillTimeouts {
     /// Timeouts of a live run, with slack for a deadline that takes effect late on a busy machine.
     pub fn live(init: Duration, wake: Duration) -> Self {
         const MORE: Duration = Duration::from_millis(250);
-        let hard = |deadline: Duration| deadline.saturating_mul(2).saturating_add(MORE);
+        let hard =
+            |deadline: Duration| deadline.saturating_mul(WALL_FACTOR + 1).saturating_add(MORE);
         Self { init: hard(init), wake: hard(wake) }
     }
 

@@ -212,7 +212,7 @@ fn a_wake_that_returns_late_is_a_fault_though_it_was_not_interrupted() {
         fault.message
     );
     assert!(fault.used > Some(4_000_000), "{}", fault.message);
-    assert!(fault.message.ends_with("ms; the deadline is 2.0 ms"), "{}", fault.message);
+    assert!(fault.message.ends_with("ms passed); the deadline is 2.0 ms"), "{}", fault.message);
     // A replay has no deadline, and a wake in time is no fault.
     TestGuest::written_within(&fills(), &limits).wake().result.unwrap();
     limits.deadline = Duration::from_secs(60);

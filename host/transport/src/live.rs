@@ -2,14 +2,25 @@
 //! publishes.
 
 use gleaner_base::{Exit, Explain};
-use gleaner_protocol::ingress::Health;
+use gleaner_protocol::ingress::{Health, JoinedParticipant};
 
-use crate::{Subscription, Transport};
+use crate::{Subscription, TopicSpec, Transport};
 
 /// A source whose samples arrive in real time.
 pub trait LiveSource: Transport + Send {
     /// Returns the state of the source. It is called once a second, and must be cheap.
     fn health(&self) -> Health;
+
+    /// Returns the participant of a network that this source is.
+    fn joined(&self) -> Option<JoinedParticipant> {
+        None
+    }
+
+    /// Returns whether a subscription that was made for `spec` also receives what `wanted`, of the
+    /// same topic, needs.
+    fn suffices(&self, spec: &TopicSpec, wanted: &TopicSpec) -> bool {
+        wanted.max_bytes <= spec.max_bytes && wanted.queue <= spec.queue
+    }
 
     /// Ends a subscription: its sink gets no further samples, once calls in progress have returned.
     /// The numbers of other subscriptions stay.

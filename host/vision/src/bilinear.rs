@@ -108,7 +108,6 @@ pub(crate) enum PixelOrder {
 }
 
 impl PixelOrder {
-    /// Returns the order of `encoding`, or refuses it.
     pub(crate) fn of(encoding: Encoding) -> Result<Self, VisionError> {
         match encoding {
             Encoding::Mono8 => Ok(Self::Grey),

@@ -158,7 +158,6 @@ pub enum VisionError {
     Placed,
 }
 
-/// Returns the advice for frames of this encoding.
 fn way_out(encoding: Encoding) -> &'static str {
     if encoding.is_raw() {
         "debayer it first, for example by image_proc"

@@ -211,7 +211,6 @@ fn checked(value: f32) -> Result<f32, f32> {
     if is_score(value) { Ok(value) } else { Err(value) }
 }
 
-/// Returns the class that a model returns as a float.
 fn class_of(value: f32) -> Option<u32> {
     // Up to here a float has every integer.
     const LAST: f32 = 16_777_215.0;

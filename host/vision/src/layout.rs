@@ -19,14 +19,12 @@ pub(crate) const BINS: usize = 8;
 /// Numbers of a row of an NMS-free detector: box, score, class.
 const NMS_FREE_ROW: u32 = 6;
 
-/// Usual strides of grids.
 const STRIDES: &[u32] = &[8, 16, 32];
 
 /// Strides of the models P2 and P6 of Ultralytics, whose metadata has the largest.
 const P2_STRIDES: &[u32] = &[4, 8, 16, 32];
 const P6_STRIDES: &[u32] = &[8, 16, 32, 64];
 
-/// Rows of the output of RT-DETR.
 const RT_DETR_ROWS: u32 = 300;
 
 /// Anchors of a cell in YOLOv5 and YOLOv7.
@@ -203,7 +201,6 @@ impl DetectorLayout {
         self.form_of(shape, input).ok_or_else(|| self.refusal(input, text()))
     }
 
-    /// Returns the error for outputs with the shapes `found`.
     pub(crate) fn refusal(self, (width, height): (u32, u32), found: String) -> VisionError {
         let [usual, all] = [STRIDES, P6_STRIDES].map(|strides| cells(strides, (width, height)));
         let expected = match self {
@@ -257,7 +254,6 @@ impl DetectorLayout {
     }
 }
 
-/// Returns the number of cells of all grids.
 fn cells(strides: &[u32], (width, height): (u32, u32)) -> u64 {
     let grid =
         |stride: &u32| u64::from(width.div_ceil(*stride)) * u64::from(height.div_ceil(*stride));

@@ -84,7 +84,6 @@ impl Preprocess {
         Ok(self.width as usize * self.height as usize * 3 * element)
     }
 
-    /// Returns the element of a level in channel `channel`.
     fn element(&self, channel: usize, level: u8) -> f32 {
         // A level fits exactly.
         (f32::from(level) * self.scale - self.mean[channel]) / self.deviation[channel]

@@ -4,10 +4,11 @@ use std::fmt::{self, Display};
 use std::io::{self, Write};
 use std::sync::{Mutex, PoisonError};
 
+use gleaner_protocol::{Holds, Layer};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::{FileType, Mode, OFlags, fstat, open};
 use rustix::stdio::{dup2_stderr, stderr};
-use tracing::{Event, Level, Subscriber};
+use tracing::{Event, Level, Subscriber, debug, warn};
 use tracing_subscriber::filter::Targets;
 use tracing_subscriber::fmt::format::Writer;
 use tracing_subscriber::fmt::{FmtContext, FormatEvent, FormatFields, layer};
@@ -30,6 +31,21 @@ pub fn init() {
         .with_writer(|| StderrWriter(io::stderr()));
     // Fails only if a subscriber is set already, which then stays.
     let _ = tracing_subscriber::registry().with(lines).with(filter).try_init();
+}
+
+/// Reports the layers of the sandbox of this process: in one line, those that are missing.
+pub fn layers(layers: impl IntoIterator<Item = Layer>) {
+    let mut missing = Vec::new();
+    for layer in layers {
+        debug!(?layer, "sandbox");
+        if layer.holds == Holds::No {
+            missing.push(format!("{} ({})", layer.name, layer.note));
+        }
+    }
+    if !missing.is_empty() {
+        let missing = missing.join(", ");
+        warn!(missing, "the sandbox of this process lacks layers; see `gleaner doctor`");
+    }
 }
 
 /// Sends log lines to standard error as [`init`] does, for a process that serves others: it never

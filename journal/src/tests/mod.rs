@@ -175,7 +175,6 @@ fn journal(header: &JournalHeader, entries: &[JournalEntry], per_block: usize) -
     writer.finish(&end(entries.len())).unwrap()
 }
 
-/// Returns all wakes of a journal, and the error that ended it, if any.
 fn read_all<R: std::io::Read>(
     reader: &mut JournalReader<R>,
 ) -> (Vec<JournalEntry>, Option<JournalError>) {

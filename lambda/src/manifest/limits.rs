@@ -96,15 +96,15 @@ limits! {
     // `init` builds its tables once, and may take as much as twenty wakes by default.
     init_fuel: u64 { min: 1_000, default: 1_000_000_000, max: 1_000_000_000_000 }
 
-    /// Time after which a wake ends with a fault. Live only: in a replay, decisions would depend on
-    /// the machine.
+    /// CPU time after which a wake ends with a fault; by the clock, five times as much. Live only:
+    /// in a replay, decisions would depend on the machine.
     deadline as "deadline_ns": Duration {
         min: Duration::from_millis(1),
         default: Duration::from_millis(50),
         max: Duration::from_secs(60)
     }
 
-    /// Time after which `init` ends with a fault. Live only.
+    /// The same for `init`. Live only.
     // Importing numpy and loading a model take seconds; five minutes are enough for any start.
     init_deadline as "init_deadline_ns": Duration {
         min: Duration::from_millis(1),

@@ -39,7 +39,7 @@ use crate::core::Core;
 use crate::layout::VehicleFolders;
 use crate::metrics;
 use crate::objects;
-use crate::streams;
+use crate::{spools, streams};
 
 /// Maximum length of a request without files: a deployment with two revisions of 4 MiB each, as
 /// text in JSON.
@@ -126,6 +126,7 @@ impl Api {
             removed: self.core.removed(),
             capacity: self.core.capacity(),
             events_lost: self.core.events.lost(),
+            records_lost: self.cloud.records_lost(),
             supervisor,
             cloud: self.cloud.status(),
             age_s: None,
@@ -228,7 +229,7 @@ async fn leave(State(api): State<Api>, Query(query): Query<LeaveQuery>) -> Reply
 }
 
 async fn events(State(api): State<Api>, Query(query): Query<StreamQuery>) -> Reply<Response> {
-    lines(&api, "", &streams::STREAMS, &query)
+    lines(&api, "", &spools::STREAMS, &query)
 }
 
 async fn records(

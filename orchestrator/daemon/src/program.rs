@@ -11,6 +11,7 @@ use std::time::{Duration, Instant};
 
 use clap::Parser;
 use gleaner_base::{Exit, Failure};
+use gleaner_fleet::entrance::Entrance;
 use gleaner_lambda::Vehicle;
 use gleaner_protocol::supervision::{EventKind, SUPERVISION_VERSION, SupervisionSpec};
 use gleaner_trust::{PublicKey, SecretKey, VehicleName};
@@ -56,6 +57,11 @@ const TIME_INTERVAL: Duration = Duration::from_secs(600);
 const REFUSED_INTERVAL: Duration = Duration::from_secs(10);
 /// Interval at which the watchdog is reset, and the clock is looked at.
 const WATCHDOG_INTERVAL: Duration = Duration::from_secs(3);
+
+/// Maximum number of connections to the socket of the API, on which users also follow records, and
+/// of those that read metrics, which any user of the machine may open.
+const CONTROL_MAX: usize = 256;
+const METRICS_MAX: usize = 64;
 
 /// The end of the program.
 enum ProgramEnd {
@@ -201,10 +207,13 @@ async fn serve(
     let (core, started) = (Arc::clone(&core), Instant::now());
     let api = Api { core: Arc::clone(&core), layout, name, key, started, cloud };
     tokio::spawn(CloudLink { api: api.clone() }.keep());
+    // The API answers until the end of the program.
+    let serving = watch::Sender::new(false);
     if let Some(address) = metrics {
-        serve_metrics(address, &api).await;
+        serve_metrics(address, &api, &serving).await;
     }
-    tokio::spawn(async move { axum::serve(listener, api.router()).await });
+    let control = ("control connections", CONTROL_MAX);
+    tokio::spawn(Entrance::plain(listener, control, api.router(), serving.subscribe()).serve());
     let _ = sd_notify::notify(&[sd_notify::NotifyState::Ready]);
     let mut watchdog = tokio::time::interval(WATCHDOG_INTERVAL);
     let mut time = tokio::time::interval(TIME_INTERVAL);
@@ -245,11 +254,12 @@ async fn serve(
 
 /// Serves the metrics at this address. A port that another program uses is an event: it must not
 /// keep lambdas from running.
-async fn serve_metrics(address: SocketAddr, api: &Api) {
+async fn serve_metrics(address: SocketAddr, api: &Api, serving: &watch::Sender<bool>) {
     match TcpListener::bind(address).await {
         Ok(listener) => {
-            let router = api.clone().metrics_router();
-            tokio::spawn(async move { axum::serve(listener, router).await });
+            let (most, router) =
+                (("metrics connections", METRICS_MAX), api.clone().metrics_router());
+            tokio::spawn(Entrance::plain(listener, most, router, serving.subscribe()).serve());
         }
         Err(error) => {
             let text = format!("the metrics are not served at {address}: {error}");

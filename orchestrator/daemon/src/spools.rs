@@ -1,21 +1,124 @@
-//! Records of deployments that were removed: they can be read for a while, and do not fill the
-//! disk.
+//! The spools of a vehicle: their streams, the records that wait in them, and what they lost. Those
+//! of deployments that were removed can be read for a while, and do not fill the disk.
 
 use std::collections::BTreeSet;
 use std::fs;
-use std::path::Path;
+use std::io;
+use std::path::{Path, PathBuf};
 
+use gleaner_protocol::vehicle_api::StreamLoss;
+use gleaner_spool::{SpoolError, SpoolFolder, SpoolStorage};
+
+use crate::store::{entries, remove};
+
+/// The streams that each vehicle has, beside those of deployments.
+pub(crate) const STREAMS: [&str; 2] = ["events", "orchestrator"];
 /// Number of removed deployments whose records are kept: those that were removed last.
 pub(crate) const KEPT: usize = 8;
+
+/// The streams of a vehicle. Tests let each operation fail.
+pub(crate) trait SpoolSource {
+    type Storage: SpoolStorage;
+
+    /// Returns the names of the streams, and the error of those that cannot be listed.
+    fn streams(&self) -> (Vec<String>, io::Result<()>);
+
+    fn open(&self, stream: &str) -> Result<Self::Storage, SpoolError>;
+}
+
+/// The streams in a folder.
+#[derive(Debug, Clone)]
+pub(crate) struct SpoolFolders(pub(crate) PathBuf);
+
+/// The records of all streams that the cloud does not have, and those that are lost.
+#[derive(Debug, Default, PartialEq)]
+pub(crate) struct SpoolCounts {
+    pub(crate) unsent: u64,
+    /// Number of streams that `unsent` does not count.
+    pub(crate) uncounted: u64,
+    pub(crate) lost: Vec<StreamLoss>,
+}
+
+impl SpoolSource for SpoolFolders {
+    type Storage = SpoolFolder;
+
+    fn streams(&self) -> (Vec<String>, io::Result<()>) {
+        let mut names = Vec::new();
+        let mut list = || {
+            for name in STREAMS {
+                if self.0.join(name).try_exists()? {
+                    names.push(name.to_owned());
+                }
+            }
+            let entries = match fs::read_dir(self.0.join("lambdas")) {
+                Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
+                entries => entries?,
+            };
+            for entry in entries {
+                names.push(format!("lambdas/{}", entry?.file_name().display()));
+            }
+            Ok(())
+        };
+        let listed = list();
+        (names, listed)
+    }
+
+    fn open(&self, stream: &str) -> Result<SpoolFolder, SpoolError> {
+        SpoolFolder::readable(&self.0.join(stream))
+    }
+}
+
+/// Returns the name of a stream in its segments: of a lambda's records, the id of its deployment.
+pub(crate) fn last_part(name: &str) -> &str {
+    name.rsplit('/').next().unwrap_or(name)
+}
+
+/// Counts what the spools note: no record is read for it.
+pub(crate) fn count(spools: &impl SpoolSource) -> SpoolCounts {
+    let (names, listed) = spools.streams();
+    // Of a folder that cannot be listed, not even the number of streams is known.
+    let mut counts = SpoolCounts { uncounted: u64::from(listed.is_err()), ..Default::default() };
+    for name in names {
+        match waiting(spools, &name) {
+            Ok((unsent, loss)) => {
+                counts.unsent += unsent;
+                counts.lost.extend(loss);
+            }
+            Err(_) => counts.uncounted += 1,
+        }
+    }
+    counts
+}
+
+/// Returns the number of records that wait in a stream, and its losses.
+fn waiting(
+    spools: &impl SpoolSource,
+    name: &str,
+) -> Result<(u64, Option<StreamLoss>), Box<dyn std::error::Error>> {
+    let storage = spools.open(name)?;
+    let released = storage.released()?;
+    let note = storage.noted()?.ok_or("its writer, of an earlier version, notes nothing")?;
+    let records = note.lost + note.pending;
+    let loss = (records > 0).then(|| StreamLoss {
+        stream: name.to_owned(),
+        records,
+        reason: note.reason.map(|reason| format!("{reason:?}")).unwrap_or_default(),
+        last_ns: note.lost_ns,
+    });
+    // Those that the budget has removed are lost, and in a gap.
+    Ok((note.durable.saturating_sub(released.max(note.removed)), loss))
+}
 
 /// Removes the records of deployments other than `kept` in the folder `lambdas` of the spools.
 /// Returns their ids.
 pub(crate) fn collect(lambdas: &Path, kept: &BTreeSet<String>) -> Vec<String> {
-    // A folder that cannot be read is tried again at the next removal.
-    let entries = fs::read_dir(lambdas).into_iter().flatten().flatten();
-    let old = entries.filter_map(|entry| {
-        let id = entry.file_name().into_string().ok().filter(|id| !kept.contains(id))?;
-        fs::remove_dir_all(entry.path()).is_ok().then_some(id)
+    // What cannot be listed or removed is in the log, and tried again at the next removal.
+    let listed = if lambdas.exists() { entries(lambdas) } else { Ok(Vec::new()) };
+    let listed = listed.inspect_err(|failure| tracing::warn!(%failure, "spools are kept"));
+    let old = listed.into_iter().flatten().filter_map(|path| {
+        let id = path.file_name()?.to_str().filter(|id| !kept.contains(*id))?.to_owned();
+        remove(&path);
+        (!path.exists()).then_some(id)
     });
     let mut old: Vec<_> = old.collect();
     old.sort();
@@ -24,7 +127,33 @@ pub(crate) fn collect(lambdas: &Path, kept: &BTreeSet<String>) -> Vec<String> {
 
 #[cfg(test)]
 mod tests {
+    use std::num::NonZeroU8;
+
+    use gleaner_spool::{BUDGET_MIN, BootId, SpoolConfig, SpoolTime, SpoolWriter};
+
     use super::*;
+
+    #[test]
+    fn records_are_counted_before_they_are_read_and_what_cannot_be_is_stated() {
+        let folder = tempfile::tempdir().unwrap();
+        let spools = SpoolFolders(folder.path().to_owned());
+        assert_eq!(count(&spools), SpoolCounts::default());
+        for (stream, records) in [("events", 5), ("lambdas/brake", 3)] {
+            let (boot, of) = (BootId([1; 16]), last_part(stream).to_owned());
+            let config = SpoolConfig { stream: of, boot, budget: BUDGET_MIN };
+            let mut writer = SpoolWriter::open(&folder.path().join(stream), config).unwrap();
+            for _ in 0..records {
+                writer.append(NonZeroU8::MIN, SpoolTime::now(), b"x").unwrap();
+            }
+            writer.commit().unwrap();
+        }
+        spools.open("events").unwrap().release(2).unwrap();
+        assert_eq!(count(&spools), SpoolCounts { unsent: 6, ..SpoolCounts::default() });
+        // As an earlier version has left it.
+        fs::remove_file(folder.path().join("events/note")).unwrap();
+        fs::write(folder.path().join("lambdas/odd"), "no folder").unwrap();
+        assert_eq!(count(&spools), SpoolCounts { unsent: 3, uncounted: 2, lost: vec![] });
+    }
 
     #[test]
     fn only_records_that_are_kept_stay() {

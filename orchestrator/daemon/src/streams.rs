@@ -8,14 +8,14 @@ use std::time::Duration;
 use axum::body::{Body, Bytes};
 use gleaner_base::{Exit, Failure, chain, hex};
 use gleaner_protocol::SpooledRecord;
-use gleaner_protocol::vehicle_api::StreamLine;
+use gleaner_protocol::vehicle_api::{StreamLine, in_order};
 use gleaner_spool::{SpoolItem, SpoolReader, SpoolRecord};
 use serde_json::{Value, json};
 use tokio::sync::mpsc;
 
 use crate::api::StreamQuery;
+use crate::spools::STREAMS;
 
-pub(crate) const STREAMS: [&str; 2] = ["events", "orchestrator"];
 /// Interval of looks for new records.
 const INTERVAL: Duration = Duration::from_millis(100);
 /// Number of pieces that wait for a slow client; then reading waits.
@@ -45,7 +45,6 @@ pub(crate) fn lines(spool: &Path, names: &[&str], query: &StreamQuery) -> Result
             name: (*name).to_owned(),
             from: query.from,
             reader: None,
-            last: Default::default(),
             has_failed: false,
         })
         .collect();
@@ -69,8 +68,6 @@ struct StreamReader {
     name: String,
     from: Option<u64>,
     reader: Option<SpoolReader>,
-    /// Boot and time of its last record that has them.
-    last: (String, u64),
     /// True if the last look at it ended with an error.
     has_failed: bool,
 }
@@ -122,8 +119,7 @@ fn send(
         for stream in &mut readers {
             // A failure is shown by the next request.
             let _ = stream.open();
-            let StreamReader { name, reader: Some(reader), last: before, has_failed, .. } = stream
-            else {
+            let StreamReader { name, reader: Some(reader), has_failed, .. } = stream else {
                 continue;
             };
             let mut kept = VecDeque::new();
@@ -146,9 +142,9 @@ fn send(
                     break;
                 }
             }
-            round.push(placed(kept, before));
+            round.extend(kept);
         }
-        let mut round = merged(round);
+        let mut round = in_order(round, |line| line.into());
         if let Some(last) = last.take() {
             round.drain(..round.len().saturating_sub(last));
         }
@@ -165,64 +161,6 @@ fn send(
             std::thread::sleep(INTERVAL);
         }
     }
-}
-
-/// A line, with the boot and the time since it by which it is ordered.
-type PlacedLine = (StreamLine, (String, u64));
-
-/// Gives each line of a stream its place: its own boot and time or, for gaps and damage, those of
-/// the record before it. `last` is the place of the last record so far.
-fn placed(lines: VecDeque<StreamLine>, last: &mut (String, u64)) -> Vec<PlacedLine> {
-    // At the begin of a stream, a gap has the place of the record after it.
-    if last.0.is_empty()
-        && let Some(first) = lines.iter().find(|line| !line.boot.is_empty())
-    {
-        *last = (first.boot.clone(), first.boot_ns);
-    }
-    let place = |line: StreamLine| {
-        if !line.boot.is_empty() {
-            *last = (line.boot.clone(), line.boot_ns);
-        }
-        (line, last.clone())
-    };
-    lines.into_iter().map(place).collect()
-}
-
-/// Merges the lines of streams, each of which keeps its order: the time of day may have been set.
-fn merged(streams: Vec<Vec<PlacedLine>>) -> VecDeque<StreamLine> {
-    let boots = boots(&streams);
-    let mut streams: Vec<_> = streams.into_iter().map(|it| it.into_iter().peekable()).collect();
-    let mut lines = VecDeque::new();
-    loop {
-        let first = streams.iter_mut().enumerate().filter_map(|(index, stream)| {
-            let (_, (boot, since)) = stream.peek()?;
-            Some((boots.iter().position(|it| it == boot), *since, index))
-        });
-        let Some((.., index)) = first.min() else { return lines };
-        lines.extend(streams[index].next().map(|(line, _)| line));
-    }
-}
-
-/// Returns the boots of all streams in their order. Those of which no stream has two are ordered by
-/// the time of day.
-fn boots(streams: &[Vec<PlacedLine>]) -> Vec<String> {
-    let mut boots: Vec<(String, i64)> = Vec::new();
-    for stream in streams {
-        let own: Vec<&String> = stream.iter().map(|(_, (boot, _))| boot).collect();
-        let mut next = 0;
-        for (line, (boot, _)) in stream {
-            if let Some(at) = boots.iter().position(|(it, _)| it == boot) {
-                next = at + 1;
-                continue;
-            }
-            let is_before =
-                |(other, at): &&(String, i64)| !own.contains(&other) && *at <= line.time_ns;
-            next += boots[next..].iter().take_while(is_before).count();
-            boots.insert(next, (boot.clone(), line.time_ns));
-            next += 1;
-        }
-    }
-    boots.into_iter().map(|(boot, _)| boot).collect()
 }
 
 fn send_piece(lines: &mut VecDeque<StreamLine>, to: &mpsc::Sender<Bytes>) -> bool {
@@ -288,19 +226,6 @@ mod tests {
 
     use super::*;
 
-    fn stream(name: &str, lines: &[(&str, u64)]) -> VecDeque<StreamLine> {
-        let lines = lines.iter().enumerate().map(|(seq, (boot, boot_ns))| StreamLine {
-            stream: name.to_owned(),
-            seq: seq as u64,
-            time_ns: 0,
-            boot_ns: *boot_ns,
-            boot: (*boot).to_owned(),
-            kind: String::new(),
-            record: Value::Null,
-        });
-        lines.collect()
-    }
-
     #[test]
     fn a_segment_that_cannot_be_read_is_named_once_and_ends_the_list() {
         let folder = tempfile::tempdir().unwrap();
@@ -323,7 +248,6 @@ mod tests {
                 name: "events".to_owned(),
                 from: None,
                 reader: None,
-                last: Default::default(),
                 has_failed: false,
             };
             reader.open().unwrap();
@@ -336,30 +260,5 @@ mod tests {
                 text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
             assert!(lines.len() == 1 && lines[0].kind == "damaged", "{text}");
         }
-    }
-
-    #[test]
-    fn streams_are_merged_by_boot_and_time_and_gaps_stay_in_their_place() {
-        let gap = ("", 0);
-        let events = [gap, ("a", 10), ("a", 30), gap, ("b", 5), ("c", 7)];
-        let orchestrator = [("a", 20), ("b", 1), ("b", 6), gap];
-        let lasts = &mut [Default::default(), Default::default()];
-        let streams = [stream("e", &events), stream("o", &orchestrator)];
-        let placed = streams.into_iter().zip(lasts).map(|(lines, last)| placed(lines, last));
-        let merged = merged(placed.collect());
-        let order: Vec<_> = merged.iter().map(|it| format!("{}{}", it.stream, it.seq)).collect();
-        assert_eq!(order, ["e0", "e1", "o0", "e2", "e3", "o1", "e4", "o2", "o3", "e5"]);
-    }
-
-    #[test]
-    fn boots_of_different_streams_are_ordered_by_the_time_of_day() {
-        let at = |boot: &str, time_ns| {
-            let mut lines = stream("e", &[(boot, 5)]);
-            lines[0].time_ns = time_ns;
-            placed(lines, &mut Default::default())
-        };
-        let of = |streams: [Vec<PlacedLine>; 2]| boots(&streams);
-        assert_eq!(of([at("b", 10), at("c", 20)]), ["b", "c"]);
-        assert_eq!(of([at("c", 20), at("b", 10)]), ["b", "c"]);
     }
 }

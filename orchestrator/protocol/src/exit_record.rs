@@ -139,13 +139,13 @@ impl Killed {
         match (self.reason, self.phase) {
             (KillReason::Overdue, Phase::Wake) => {
                 "do less in one wake, or raise `deadline` in [limits]: a process is killed after \
-                 twice the deadline plus 0.35 s; in a replay, after 100 times the deadline, but at \
-                 least a minute"
+                 six times the deadline plus 0.35 s; in a replay, after 100 times the deadline, \
+                 but at least a minute"
             }
             (KillReason::Overdue, Phase::Init) => {
                 "do less in `init`, or raise `init_deadline` in [limits]: a process is killed \
-                 after twice the deadline plus 0.35 s; in a replay, after 10 times the deadline, \
-                 but at least a minute"
+                 after six times the deadline plus 0.35 s; in a replay, after 10 times the \
+                 deadline, but at least a minute"
             }
             (KillReason::Overdue, Phase::Housekeeping) => {
                 "no wake ran, so no deadline is too short: look for threads or native code of the \

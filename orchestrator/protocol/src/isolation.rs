@@ -11,6 +11,16 @@ pub const LAYERS_ENV: &str = "GLEANER_LAYERS";
 /// The environment variable in which `gleaner-shim` passes its process id to its runtime.
 pub const SHIM_ENV: &str = "GLEANER_SHIM";
 
+/// The layers without which `gleaner-shim` starts no lambda. A lambda without the first two could
+/// open sockets and act on other processes; one with the third, a priority that cannot be given up,
+/// could take a core for itself.
+pub const REQUIRED_LAYERS: [&str; 3] = ["system calls", "sockets", "real-time priority"];
+
+/// The way out if one of [`REQUIRED_LAYERS`] is missing.
+pub const REQUIRED_HELP: &str = "let the kernel or the container permit the system call \
+    `seccomp`, as with `docker run --security-opt seccomp=PROFILE`; `gleaner doctor` names what is \
+    missing";
+
 /// A layer of isolation around a lambda's process, as tested on this machine.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Layer {
@@ -35,6 +45,11 @@ pub enum Holds {
 }
 
 impl Layer {
+    /// Returns whether no lambda may run, as this layer is missing.
+    pub fn prevents_lambdas(&self) -> bool {
+        self.holds == Holds::No && REQUIRED_LAYERS.contains(&&*self.name)
+    }
+
     /// Creates a layer that holds.
     pub fn yes(name: &str, note: impl Into<String>) -> Self {
         Self { name: name.to_owned(), holds: Holds::Yes, note: note.into() }

@@ -7,6 +7,10 @@ use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::supervision::{LambdaStatus, SupervisorStatus};
 
+pub use order::{LinePlace, in_order};
+
+mod order;
+
 /// Name of the API's socket in the run folder of the orchestrator.
 pub const API_SOCKET: &str = "control.sock";
 
@@ -37,6 +41,9 @@ pub struct VehicleStatus {
     /// Number of events of the orchestrator that could not be made durable.
     #[serde(default)]
     pub events_lost: u64,
+    /// Losses of streams whose records could not be written, also before a kill or a power cut.
+    #[serde(default)]
+    pub records_lost: Vec<StreamLoss>,
     /// The processes; absent while the supervisor cannot be reached.
     #[cfg_attr(feature = "schema", schemars(with = "Option<serde_json::Value>"))]
     pub supervisor: Option<SupervisorStatus>,
@@ -61,8 +68,7 @@ pub struct CloudStatus {
     pub address: String,
     /// Its state: `connecting`, `connected`, or `refused` by the cloud.
     pub state: String,
-    /// The reason why it is not connected, if it is known. While it is connected: a stream whose
-    /// records cannot be sent; `unsent` does not count these.
+    /// The reason why it is not connected, if it is known.
     pub reason: Option<String>,
     /// Help for the user with that reason.
     #[serde(default)]
@@ -71,10 +77,82 @@ pub struct CloudStatus {
     pub since_s: f64,
     /// Number of the newest wanted state of the cloud that was handled.
     pub generation: u64,
-    /// Number of records that were sent, and that the cloud has not acknowledged.
+    /// Number of records in the spools that the cloud has not acknowledged, also of those that were
+    /// not read yet.
     pub unsent: u64,
+    /// Number of streams that `unsent` does not count: their spools cannot be read, or are of an
+    /// earlier version.
+    #[serde(default)]
+    pub uncounted: u64,
+    /// Streams that could not be sent at their last try, by cause.
+    #[serde(default)]
+    pub failing: Vec<FailingStreams>,
     /// End of the vehicle's certificate, in s since 1970.
     pub certificate_expires: u64,
+    /// The clips on their way to the cloud.
+    #[serde(default)]
+    pub clips: ClipsStatus,
+}
+
+/// The clips of a vehicle on their way to the cloud.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct ClipsStatus {
+    /// Bytes of the list of clips that the cloud does not have yet; absent while it is unknown.
+    pub unannounced_bytes: Option<u64>,
+    /// Number of clips that the cloud wants, and that have not arrived in full; at most 64, and
+    /// absent while it is unknown.
+    pub waiting: Option<u64>,
+    /// Number of clips that cannot be read now. They are looked at again.
+    pub unreadable: u64,
+    /// The reason why none is sent now, if there is one.
+    pub paused: Option<String>,
+    /// The clip that has been tried most often without any progress, once that is 5 times.
+    pub stuck: Option<StuckClip>,
+}
+
+/// A clip that makes no progress on its way to the cloud.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct StuckClip {
+    /// Its name; absent if it is the list of clips that cannot be exchanged.
+    pub name: Option<String>,
+    /// Number of attempts since the last progress.
+    pub attempts: u64,
+    /// Time since the first of these, in s.
+    pub since_s: f64,
+    /// The cause of the last failure.
+    pub cause: String,
+}
+
+/// Streams that cannot be sent for the same cause.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct FailingStreams {
+    /// The cause, such as the error of the file system.
+    pub cause: String,
+    /// Number of the streams.
+    pub streams: u64,
+    /// The failed action of one of them, with its causes.
+    pub example: String,
+    /// Time since the first of them has failed, in s.
+    pub since_s: f64,
+    /// Time since the last try, in s. None is tried without a connection.
+    pub tried_s: f64,
+}
+
+/// Records of a stream that could not be written to its spool.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct StreamLoss {
+    /// Name of the stream: of a lambda's records, `lambdas/ID`.
+    pub stream: String,
+    /// Number of the records, since the spool was created.
+    pub records: u64,
+    /// Reason of the last loss, as in a line of kind `gap`.
+    pub reason: String,
+    /// Time of the last loss, in ns since 1970, as the clock was set.
+    pub last_ns: i64,
 }
 
 /// The status of a program.

@@ -15,13 +15,17 @@ use rustix::fs::{
 use rustix::io::Errno;
 
 use crate::format::segment_name;
-use crate::{SegmentFile, SpoolError, SpoolStorage};
+use crate::note::NOTE_LEN;
+use crate::{SegmentFile, SpoolError, SpoolNote, SpoolStorage};
 
 /// Name of the file that a writer locks.
 const LOCK: &str = "writer.lock";
 
 /// Name of the file with the first number that the consumer may still need, and its checksum.
 const RELEASED: &str = "released";
+
+/// Name of the file with the last note of the writer.
+const NOTE: &str = "note";
 
 /// Permissions of the files in the folder.
 const MODE: Mode = Mode::RUSR.union(Mode::WUSR);
@@ -273,6 +277,23 @@ impl SpoolStorage for SpoolFolder {
         let number = before.to_le_bytes();
         let bytes = [&number[..], &crc32fast::hash(&number).to_le_bytes()].concat();
         self.open_file(RELEASED, OFlags::WRONLY | OFlags::CREATE)?.write_all_at(&bytes, 0)
+    }
+
+    fn noted(&self) -> io::Result<Option<SpoolNote>> {
+        let file = match self.open_file(NOTE, OFlags::RDONLY) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+            opened => opened?,
+        };
+        let mut bytes = [0; NOTE_LEN];
+        let mut read =
+            || file.read_exact_at(&mut bytes, 0).ok().and_then(|()| SpoolNote::parse(&bytes));
+        // Its writer may have been about to replace it.
+        Ok(read().or_else(read))
+    }
+
+    fn note(&self, note: &SpoolNote) -> io::Result<()> {
+        let file = self.open_file(NOTE, OFlags::WRONLY | OFlags::CREATE)?;
+        file.write_all_at(&note.to_bytes(), 0)
     }
 }
 

@@ -91,13 +91,13 @@ pub enum GapReason {
     Torn = 5,
     /// Their bytes were changed. Only a reader reports this.
     Damaged = 6,
-    /// No segment has them. Only a reader reports this. If the budget removed them, a gap record
-    /// with [`Budget`](Self::Budget) follows later.
+    /// No segment has them, and the writer has not noted that the budget removed them. Only a
+    /// reader reports this.
     Missing = 7,
 }
 
 impl GapReason {
-    fn from_code(code: u8) -> Option<GapReason> {
+    pub(crate) fn from_code(code: u8) -> Option<GapReason> {
         use GapReason::{Budget, Damaged, DiskFull, Missing, QueueFull, Torn, WriteFailed};
         let all = [Budget, DiskFull, WriteFailed, QueueFull, Torn, Damaged, Missing];
         all.into_iter().find(|reason| *reason as u8 == code)
@@ -239,6 +239,6 @@ fn u32_at(bytes: &[u8], at: usize) -> u32 {
     u32::from_le_bytes(bytes[at..at + 4].try_into().expect("4 bytes"))
 }
 
-fn u64_at(bytes: &[u8], at: usize) -> u64 {
+pub(crate) fn u64_at(bytes: &[u8], at: usize) -> u64 {
     u64::from_le_bytes(bytes[at..at + 8].try_into().expect("8 bytes"))
 }

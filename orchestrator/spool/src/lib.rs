@@ -7,6 +7,7 @@
 mod error;
 mod folder;
 mod format;
+mod note;
 mod queue;
 mod reader;
 mod scan;
@@ -16,6 +17,7 @@ mod writer;
 pub use error::SpoolError;
 pub use folder::SpoolFolder;
 pub use format::{BootId, GapReason, NAME_MAX, PAYLOAD_MAX, SpoolGap, SpoolTime};
+pub use note::SpoolNote;
 pub use reader::{SpoolItem, SpoolReader, SpoolRecord};
 pub use storage::{SegmentFile, SpoolStorage};
 pub use writer::{BUDGET_MIN, SpoolConfig, SpoolStatus, SpoolWriter, TornTail};

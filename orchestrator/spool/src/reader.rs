@@ -259,7 +259,12 @@ impl<S: SpoolStorage> SpoolReader<S> {
             _ => head.seq,
         };
         if expected < hole_end {
-            let reason = if damaged { GapReason::Damaged } else { GapReason::Missing };
+            let noted = self.storage.noted().ok().flatten();
+            let reason = match damaged {
+                true => GapReason::Damaged,
+                false if noted.is_some_and(|it| hole_end <= it.removed) => GapReason::Budget,
+                false => GapReason::Missing,
+            };
             self.expected = Some(hole_end);
             let gap = SpoolGap { from: expected, to: hole_end - 1, reason, record: None };
             return Ok(SpoolItem::Gap(gap));

@@ -2,6 +2,8 @@
 
 use std::io;
 
+use crate::SpoolNote;
+
 /// The folder of one stream. Segments are named by their first sequence number. Each operation
 /// fails with the errors of the file system.
 pub trait SpoolStorage {
@@ -46,6 +48,16 @@ pub trait SpoolStorage {
     /// Notes that the consumer has stored all records below `before` elsewhere. A power cut may
     /// take the note.
     fn release(&self, _before: u64) -> io::Result<()> {
+        Ok(())
+    }
+
+    /// Returns the last [`note`](Self::note) of a writer; `None` without one.
+    fn noted(&self) -> io::Result<Option<SpoolNote>> {
+        Ok(None)
+    }
+
+    /// Writes a note in place of the last one, so that only the first one needs room.
+    fn note(&self, _note: &SpoolNote) -> io::Result<()> {
         Ok(())
     }
 }

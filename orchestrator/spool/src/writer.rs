@@ -15,7 +15,7 @@ use crate::format::{
 };
 use crate::queue::RecordQueue;
 use crate::scan::SegmentScan;
-use crate::{SegmentFile, SpoolError, SpoolFolder, SpoolStorage};
+use crate::{SegmentFile, SpoolError, SpoolFolder, SpoolNote, SpoolStorage};
 
 /// Minimum budget of a stream.
 pub const BUDGET_MIN: ByteSize = ByteSize::kib(64);
@@ -88,6 +88,9 @@ pub struct SpoolWriter<S: SpoolStorage = SpoolFolder> {
     failure: Option<GapReason>,
     recovered: Option<TornTail>,
     counts: SpoolStatus,
+    /// The next note, and the one that is written.
+    note: SpoolNote,
+    written_note: Option<SpoolNote>,
 }
 
 #[derive(Debug)]
@@ -154,6 +157,8 @@ impl<S: SpoolStorage> SpoolWriter<S> {
             failure: None,
             recovered: None,
             counts: SpoolStatus::default(),
+            note: SpoolNote::default(),
+            written_note: None,
             storage,
             config,
         };
@@ -168,7 +173,34 @@ impl<S: SpoolStorage> SpoolWriter<S> {
         if writer.storage.released().is_ok_and(|released| released > writer.next) {
             let _ = writer.storage.release(writer.durable);
         }
+        writer.note = writer.storage.noted().ok().flatten().unwrap_or_default();
+        // Those of numbers that are used again were not removed.
+        writer.note.removed = writer.note.removed.min(writer.next);
+        writer.mark_taken();
+        writer.keep_note();
         Ok(writer)
+    }
+
+    /// Marks the numbers that a writer gave out while writing failed, and that were lost with it.
+    fn mark_taken(&mut self) {
+        let SpoolNote { next, reason, .. } = self.note;
+        let Some(reason) = reason.filter(|_| self.note.is_failing) else { return };
+        if (self.next + 1..SEQ_END / 2).contains(&next) {
+            (self.note.pending, self.failure) = (next - self.next, Some(reason));
+            self.note.lost_ns = SpoolTime::now().wall_ns;
+            let from = std::mem::replace(&mut self.next, next);
+            self.push_gap(from, next - 1, reason);
+        }
+    }
+
+    /// Notes what a kill would take, if it has changed. A note that cannot be written is lost with
+    /// the writer only.
+    fn keep_note(&mut self) {
+        self.note.is_failing = self.failure.is_some() || self.note.pending > 0;
+        (self.note.durable, self.note.next) = (self.durable, self.next);
+        if self.written_note != Some(self.note) {
+            self.written_note = self.storage.note(&self.note).is_ok().then_some(self.note);
+        }
     }
 
     /// Finds the next number in the last segment, and marks its torn tail.
@@ -215,10 +247,10 @@ impl<S: SpoolStorage> SpoolWriter<S> {
         time: SpoolTime,
         payload: &[u8],
     ) -> Result<u64, SpoolError> {
-        let stream = || self.config.stream.clone();
         let (bytes, most) = (payload.len(), (self.queue_max() / 2).min(PAYLOAD_MAX));
         if bytes > most {
-            return Err(SpoolError::TooLong { stream: stream(), bytes, most });
+            let stream = self.config.stream.clone();
+            return Err(SpoolError::TooLong { stream, bytes, most });
         }
         let (seq, is_full) = (self.next, self.queue.len() + HEAD_LEN + bytes > self.queue_max());
         if self.refused.is_some() || is_full {
@@ -226,10 +258,17 @@ impl<S: SpoolStorage> SpoolWriter<S> {
             let (_, reason) = *self.refused.get_or_insert((seq, reason));
             self.next += 1;
             self.counts.refused += 1;
-            return Err(SpoolError::Refused { stream: stream(), seq, reason });
+            self.note.pending += 1;
+            (self.note.lost_ns, self.note.reason) = (time.wall_ns, Some(reason));
+            self.keep_note();
+            let stream = self.config.stream.clone();
+            return Err(SpoolError::Refused { stream, seq, reason });
         }
         self.next += 1;
         self.queue.push(seq, kind.get(), time, payload);
+        if self.failure.is_some() {
+            self.keep_note();
+        }
         Ok(seq)
     }
 
@@ -253,11 +292,14 @@ impl<S: SpoolStorage> SpoolWriter<S> {
             self.counts.failed_commits += 1;
             let reason =
                 if is_full(&source) { GapReason::DiskFull } else { GapReason::WriteFailed };
-            self.failure = Some(reason);
+            (self.failure, self.note.reason) = (Some(reason), Some(reason));
+            self.keep_note();
             let (stream, durable) = (self.config.stream.clone(), self.durable);
             return Err(SpoolError::Write { stream, durable, source });
         }
         self.failure = None;
+        self.note.lost += std::mem::take(&mut self.note.pending);
+        self.keep_note();
         Ok(self.durable)
     }
 
@@ -393,6 +435,9 @@ impl<S: SpoolStorage> SpoolWriter<S> {
             segment.removed_by = Some(record);
         }
         self.counts.removed += last - first + 1;
+        // Before they are removed: readers give that as the reason.
+        self.note.removed = last + 1;
+        self.keep_note();
     }
 
     /// Removes the marked segments once their gap records are durable. One that cannot be removed

@@ -100,7 +100,7 @@ impl ProcessGroup<'_> {
             }
             OutputPiece::Ingress(report) => ingress.show(report, *observer),
             OutputPiece::Inference(event) => {
-                if let InferenceEvent::Ended(reason, _) = &event {
+                if let InferenceEvent::Ended(reason, ..) = &event {
                     self.failures.add(reason.clone(), false);
                 }
                 observer.inference(event);

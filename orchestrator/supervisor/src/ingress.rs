@@ -5,13 +5,17 @@ use std::sync::mpsc::SyncSender;
 
 use gleaner_base::{Exit, Failure, chain};
 use gleaner_protocol::Handover;
-use gleaner_protocol::ingress::{IngressControl, IngressReport, IngressStatus, IngressTopic};
+use gleaner_protocol::ingress::{
+    IngressControl, IngressReport, IngressStatus, IngressTopic, JoinedParticipant,
+};
 use gleaner_protocol::link::LinkError;
 
+use crate::farewell;
 use crate::observer::RunObserver;
 use crate::output::{ChildId, ChildOutput, PIPES};
 use crate::process::ChildProcess;
-use crate::service_restarts::{SILENCE, ServiceRestarts};
+use crate::restart_delay::SILENCE;
+use crate::service_restarts::ServiceRestarts;
 use crate::{RunContext, arguments};
 
 pub(crate) struct IngressProcess {
@@ -23,6 +27,8 @@ pub(crate) struct IngressProcess {
     /// Set at the end of the drive.
     pub(crate) drive_ended: bool,
     has_ended: bool,
+    /// Its participant, until the end of that is announced.
+    joined: Option<JoinedParticipant>,
     pub(crate) status: Option<Box<IngressStatus>>,
     /// Last status of each topic that had a reader.
     topics: Vec<IngressTopic>,
@@ -76,6 +82,7 @@ impl IngressProcess {
             restarts,
             drive_ended: false,
             has_ended: false,
+            joined: None,
             status: None,
             topics: Vec::new(),
             earlier_topics,
@@ -118,6 +125,13 @@ impl IngressProcess {
         self.child.kill();
     }
 
+    /// Makes other nodes forget its participant, now that the process has ended.
+    pub(crate) fn leave_network(&mut self) {
+        if let Some(joined) = self.joined.take() {
+            farewell::send(&joined);
+        }
+    }
+
     pub(crate) fn end_reason(&self, status: ExitStatus) -> String {
         self.restarts.reason("the ingress", status)
     }
@@ -131,6 +145,7 @@ impl IngressProcess {
         observer.ingress(&report);
         self.restarts.reports();
         match report {
+            IngressReport::Joined(joined) => self.joined = Some(joined),
             IngressReport::Ready => self.restarts.is_ready = true,
             IngressReport::DriveEnded => self.drive_ended = true,
             // Only of `gleaner-ingress topics`.

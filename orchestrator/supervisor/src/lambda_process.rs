@@ -44,8 +44,12 @@ pub(crate) struct LambdaProcess {
 pub(crate) enum ProcessEnd {
     /// On request.
     Complete(Exit),
-    /// The lambda could not start; a program has printed the cause.
-    NotStarted(Exit),
+    /// The lambda could not start; a program has printed the cause. It is `blameless` if its shim
+    /// started no process, as the machine lacks what the sandbox or a process needs.
+    NotStarted {
+        exit: Exit,
+        blameless: bool,
+    },
     Broken {
         reason: String,
         faulted: bool,
@@ -110,7 +114,10 @@ impl LambdaProcess {
             }
             // Our programs print an error before; another code is one that the lambda's code chose.
             Some(exit) if !self.is_ready && exit != Exit::Ok && self.error.message().is_some() => {
-                ProcessEnd::NotStarted(exit)
+                // The shim records each end of a process that it has started, if it can: a full
+                // disk must not hide that the lambda is at fault.
+                let blameless = exit == Exit::Internal && record.is_none();
+                ProcessEnd::NotStarted { exit, blameless }
             }
             _ => {
                 let reason = match record.as_ref() {

@@ -5,7 +5,8 @@
 //! - `grants`, `arguments`: topics and arguments of the processes.
 //! - `process`, `output`, `lines`, `byte_rate`: one process, and the threads that read its output.
 //! - `ingress`, `recorder`, `inference`: the processes that all lambdas share, each over its
-//!   restarts (`service_restarts`). `last_error`: the message that explains an end.
+//!   restarts (`service_restarts`). `last_error`: the message that explains an end. `farewell`: the
+//!   end of the ingress, as other nodes see it.
 //! - `supervised`, `lambda_state`: one lambda over all its restarts, with `summary` and
 //!   `recent_wakes`.
 //! - `process_group`: all processes, `group_end`: their end, and `drive`: a drive that the ingress
@@ -23,6 +24,7 @@ mod crash_loop;
 mod drive;
 mod event_log;
 mod failures;
+mod farewell;
 mod grants;
 mod group_end;
 mod group_output;
@@ -63,7 +65,7 @@ use gleaner_parts::Parts;
 pub use event_log::EventLog;
 use failures::Failures;
 use group_end::GroupEnd;
-pub use inference::{InferenceEvent, InferenceService};
+pub use inference::{InferenceEvent, InferenceService, InferenceUse};
 pub use observer::{RestartedPart, RunObserver};
 use process_group::{ProcessGroup, RunRecord};
 pub use reconcile::{Action, KnownLambda, reconcile};

@@ -19,7 +19,7 @@ use gleaner_protocol::ingress::AddTopics;
 use crate::drive::DriveProgress;
 use crate::failures::Failures;
 use crate::group_end::GroupEnd;
-use crate::inference::InferenceService;
+use crate::inference::{InferenceService, InferenceUse};
 use crate::ingress::IngressProcess;
 use crate::observer::{RestartedPart, RunObserver};
 use crate::output::{ChildId, ChildOutput, OutputPiece};
@@ -107,7 +107,8 @@ impl<'a> ProcessGroup<'a> {
                 drop(sender.send(ChildOutput { from: ChildId::Inference, piece }));
             };
             let (parts, limits) = (&self.context.parts, &self.vehicle.inference);
-            self.inference = Some(InferenceService::start(parts, limits, None, send)?);
+            self.inference =
+                Some(InferenceService::start(parts, limits, InferenceUse::Shared, send)?);
         }
         Ok(())
     }
@@ -252,7 +253,9 @@ impl<'a> ProcessGroup<'a> {
             && !lambda.manifest.models.is_empty()
         {
             let build = BuildDir::of(&lambda.folder);
-            connections.inference = Some(inference.add(lambda.name(), &build, &lambda.manifest)?);
+            // A lambda of another deployment may have the same name.
+            let id = lambda.deployment.as_ref().map_or(lambda.name(), |it| &it.id);
+            connections.inference = Some(inference.add(id, &build, &lambda.manifest)?);
         }
         // If its shim is killed, it writes none: that of the process before it would be read.
         let _ = std::fs::remove_file(lambda.exit_record());
@@ -334,6 +337,7 @@ impl<'a> ProcessGroup<'a> {
         }
         self.drain(|group| group.ingress.open_pipes > 0);
         let Self { ingress, observer, .. } = self;
+        ingress.leave_network();
         let reason = ingress.end_reason(status);
         observer.ingress_gone();
         let (delay, starts) = (ingress.restarts.ended(status), ingress.restarts.start + 1);
@@ -437,6 +441,7 @@ impl<'a> ProcessGroup<'a> {
             let recorder = group.recorder.as_ref().map_or(0, |recorder| recorder.open_pipes);
             group.ingress.open_pipes > 0 || recorder > 0
         });
+        self.ingress.leave_network();
         self.ingress.show_last(self.observer);
         Ok(())
     }

@@ -7,6 +7,8 @@ use std::time::Duration;
 
 use rustix::process::Signal;
 
+/// Maximum time between two reports of a process that is ready: it sends one each second.
+pub(crate) const SILENCE: Duration = Duration::from_secs(15);
 /// Delay before the first restart; it doubles with each further one.
 const DELAY: Duration = Duration::from_secs(1);
 /// As [`DELAY`], of a process that all lambdas need.

@@ -9,9 +9,6 @@ use crate::last_error::LastError;
 use crate::process::ended;
 use crate::restart_delay::{ServiceDelays, was_killed};
 
-/// Maximum time between two reports of a process that is ready: it sends one each second.
-pub(crate) const SILENCE: Duration = Duration::from_secs(15);
-
 /// One process, and the number of those before it.
 #[derive(Debug)]
 pub(crate) struct ServiceRestarts {

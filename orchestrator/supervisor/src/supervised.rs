@@ -390,7 +390,7 @@ impl SupervisedLambda {
         let Some(process) = self.take_process() else { return };
         observer.lambda_gone(&self.lambda);
         let (prefix, is_kept) = (&self.lambda.prefix, self.is_kept());
-        let mut is_unusable = false;
+        let (mut is_unusable, mut is_blameless) = (false, false);
         let (reason, faulted) = match process.classify(&self.lambda, status, is_ending) {
             ProcessEnd::Complete(exit) if is_ending || !is_kept => {
                 self.exit = exit;
@@ -400,7 +400,7 @@ impl SupervisedLambda {
             ProcessEnd::Complete(_) => ("another program has ended its process".to_owned(), false),
             // It has printed the cause. After a successful start it is restarted, since the cause
             // may be temporary.
-            ProcessEnd::NotStarted(exit) if !self.was_ready && !is_kept => {
+            ProcessEnd::NotStarted { exit, .. } if !self.was_ready && !is_kept => {
                 failures.add_not_started(exit);
                 self.state = LambdaState::NotStarted;
                 if !prefix.is_empty() {
@@ -408,9 +408,10 @@ impl SupervisedLambda {
                 }
                 return;
             }
-            ProcessEnd::NotStarted(exit) => {
+            ProcessEnd::NotStarted { exit, blameless } => {
+                is_blameless = blameless;
                 // A start with the same files and settings fails again.
-                is_unusable = is_kept && matches!(exit, Exit::Usage | Exit::Denied);
+                is_unusable = is_kept && !blameless && matches!(exit, Exit::Usage | Exit::Denied);
                 (process.not_started(is_kept), exit == Exit::LambdaFaulted)
             }
             ProcessEnd::Broken { reason, faulted } => (reason, faulted),
@@ -428,9 +429,10 @@ impl SupervisedLambda {
         }
         if is_kept {
             let ready_for = if is_ready { self.since.elapsed() } else { Duration::ZERO };
-            let is_loop = match is_outside {
-                true => self.crashes.killed(ready_for),
-                false => self.crashes.ended(Instant::now(), is_ready),
+            let is_loop = match (is_blameless, is_outside) {
+                (true, _) => None,
+                (false, true) => self.crashes.killed(ready_for),
+                (false, false) => self.crashes.ended(Instant::now(), is_ready),
             };
             if is_unusable {
                 return self.quarantine(reason);

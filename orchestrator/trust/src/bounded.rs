@@ -17,7 +17,6 @@ where
     Text::deserialize(from).map(|text| text.0)
 }
 
-/// Deserialises such a text, or null.
 pub(crate) fn text_or_null<'de, D, T>(from: D) -> Result<Option<T>, D::Error>
 where
     D: Deserializer<'de>,

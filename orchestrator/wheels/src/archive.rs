@@ -37,7 +37,6 @@ pub(crate) struct FileDigest {
     pub(crate) sha256: [u8; 32],
 }
 
-/// A file of a wheel that an environment gets.
 #[derive(Debug, PartialEq)]
 pub(crate) struct WheelFile {
     index: usize,

@@ -76,12 +76,10 @@ struct WantedFiles {
     /// The paths of the wheels, with the files that they have. One is open at a time: a lambda may
     /// have more wheels than a process may have open files.
     wheels: Vec<(PathBuf, Vec<WheelFile>)>,
-    /// Folder of packages in the environment.
     packages: PathBuf,
     /// Paths in the environment, with the number of the wheel.
     files: BTreeMap<PathBuf, (FileDigest, usize)>,
     folders: BTreeSet<PathBuf>,
-    /// The text of `pyvenv.cfg`.
     config: String,
     /// The target of the interpreter, which is a link.
     program: PathBuf,
@@ -120,7 +118,6 @@ impl WantedFiles {
         Ok(Self { wheels, packages, files, folders, config, program })
     }
 
-    /// Returns a difference between the environment in `root` and the wanted one.
     fn difference(&self, root: &Path) -> io::Result<Option<String>> {
         let found = match root.symlink_metadata() {
             Err(error) if error.kind() == io::ErrorKind::NotFound => {

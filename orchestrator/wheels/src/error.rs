@@ -51,7 +51,6 @@ pub enum WheelError {
     Parts(#[from] PartsError),
 }
 
-/// Names the wheels of a conflict, which may be one.
 fn both(first: &str, second: &str, count: &str) -> String {
     match first == second {
         true => format!("wheel `{first}` has {count}").trim_end().to_owned(),

@@ -75,7 +75,6 @@ impl Interpreter {
         self.flags.contains('t')
     }
 
-    /// Returns the folder of packages in its environments.
     pub(crate) fn packages(&self) -> PathBuf {
         let ((major, minor), t) = (self.version, if self.is_free_threaded() { "t" } else { "" });
         format!("lib/python{major}.{minor}{t}/site-packages").into()
@@ -96,7 +95,6 @@ impl Interpreter {
         format!("py{major} up to {minor}, {abi}{stable}, and platforms up to {}", self.platform())
     }
 
-    /// Returns the options of `gleaner build` for it.
     pub(crate) fn build_options(&self) -> String {
         let (major, minor) = self.version;
         format!("--python-version {major}.{minor} --python-platform {}", self.platform())

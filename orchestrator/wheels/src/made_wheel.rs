@@ -54,7 +54,6 @@ impl MadeWheel {
         self
     }
 
-    /// Adds text to RECORD.
     pub(crate) fn listed(mut self, text: &str) -> Self {
         self.record += text;
         self

@@ -43,7 +43,6 @@ impl Explain for DriveError {
     }
 }
 
-/// The files of a drive, and the position in them.
 pub(crate) struct Drive {
     paths: Vec<PathBuf>,
     topics: Vec<PlayedTopic>,
@@ -186,7 +185,6 @@ fn begin_at(replay: &mut Replay, paths: &[PathBuf], from_ns: i64) {
 /// The DDS name of the type of compressed images.
 const COMPRESSED: &str = "sensor_msgs::msg::dds_::CompressedImage_";
 
-/// The requested topics of `replay`, or all.
 fn wanted(replay: &Replay, names: &[String]) -> Result<Vec<DiscoveredTopic>, Failure> {
     let topics = replay.topics();
     if let Some(unknown) =

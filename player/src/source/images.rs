@@ -12,10 +12,8 @@ use crate::cdr;
 
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum ConvertError {
-    /// The message is not a `CompressedImage`.
     #[error("not a sensor_msgs/msg/CompressedImage")]
     Message(#[from] CdrError),
-    /// The image data is invalid.
     #[error("invalid image data: {0}")]
     Image(#[from] ImageError),
 }
@@ -23,7 +21,6 @@ pub(crate) enum ConvertError {
 /// Maximum bytes of an image in rgb8: 21 million pixels.
 const MAX_BYTES: usize = 64 << 20;
 
-/// Decodes the images of one drive.
 pub(crate) struct Decoder {
     size: Option<Size>,
     stamp: HeaderStamp,

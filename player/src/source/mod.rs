@@ -12,7 +12,6 @@ use crate::args::Args;
 use crate::offer::Offer;
 use crate::queue::QueuedMessage;
 
-/// A topic that a source has messages for.
 #[derive(Clone, Debug)]
 pub(crate) struct PlayedTopic {
     /// Its ROS 2 name, which is valid, like its type.
@@ -31,7 +30,6 @@ pub(crate) trait MessageSource: Send {
     /// The next message, in the order of their times; `None` at the end.
     fn next(&mut self) -> Result<Option<QueuedMessage>, Failure>;
 
-    /// Bytes of messages to read ahead.
     fn read_ahead(&self) -> usize;
 
     /// Number of messages of a topic that could not be converted.
@@ -53,7 +51,6 @@ impl<'a> Remaps<'a> {
         Remaps(args.remap.iter().map(|(from, to)| (from.as_str(), to.as_str())).collect())
     }
 
-    /// Removes and returns the new name of `topic`, if there is one.
     fn take(&mut self, topic: &str) -> Option<&'a str> {
         self.0.remove(topic)
     }

@@ -19,7 +19,6 @@ const IMU: &str = "/imu/synthetic";
 
 const SEED: u64 = 0x676c_6561_6e65_7221;
 
-/// The sensors, merged by time.
 pub(crate) struct Synthetic {
     topics: Vec<PlayedTopic>,
     sensors: Vec<SyntheticSensor>,

@@ -106,7 +106,6 @@ where
     }
 }
 
-/// Identity of a wake within a run.
 #[derive(Clone, PartialEq, Eq, Hash)]
 struct WakeKey {
     at_ns: i64,

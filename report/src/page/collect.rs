@@ -178,7 +178,6 @@ impl RunItems {
     }
 }
 
-/// Sets the drive and the part of it that was replayed.
 fn set_drive(run: &mut PageRun, summary: &RunSummary) {
     let RunSummary::Replay(replay) = summary else { return };
     run.drive = replay.drive.iter().map(|path| path.display().to_string()).collect();
@@ -377,7 +376,6 @@ fn facts(summary: &RunSummary) -> Vec<Fact> {
     }
 }
 
-/// Maps each key to its positions in `keys`.
 pub(super) fn positions<K: std::hash::Hash + Eq>(
     keys: impl Iterator<Item = K>,
 ) -> HashMap<K, Vec<usize>> {

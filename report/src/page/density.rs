@@ -10,7 +10,6 @@ const BINS_MAX: usize = 4096;
 /// Width of the first bins, as a power of two, in ns: about a millisecond.
 const FIRST_SHIFT: u32 = 20;
 
-/// Counts by lane and time.
 #[derive(Debug)]
 pub(super) struct Density {
     /// Bins are `1 << shift` ns wide.

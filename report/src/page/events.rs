@@ -56,7 +56,6 @@ impl TextBudget {
     }
 }
 
-/// The collected triggers and faults.
 #[derive(Default)]
 pub(super) struct Events {
     start_ns: i64,

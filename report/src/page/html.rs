@@ -11,7 +11,6 @@ use sha2::{Digest, Sha256};
 const PAGE: &str = include_str!("../../assets/page/page.html");
 const STYLE: [&str; 2] =
     [include_str!("../../assets/uPlot.min.css"), include_str!("../../assets/page/page.css")];
-/// uPlot, which draws the plots.
 const PLOTS: &str = include_str!("../../assets/uPlot.iife.min.js");
 const PLOTS_LICENSE: &str = include_str!("../../assets/uPlot.LICENSE");
 pub(crate) const MEASUREMENT_SCRIPTS: &[&str] = &[
@@ -37,7 +36,6 @@ pub(super) const RUN_SCRIPTS: &[&str] = &[
     include_str!("../../assets/page/main.js"),
 ];
 
-/// Renders a page with the data `page`.
 pub(crate) fn html(page: &impl Serialize, scripts: &[&str]) -> String {
     let script = script(scripts);
     let policy = format!(
@@ -84,7 +82,6 @@ pub(super) fn json(value: &impl Serialize) -> String {
     text
 }
 
-/// Returns the `data:` URL of a JPEG.
 pub(super) fn jpeg_address(jpeg: &[u8]) -> String {
     format!("data:image/jpeg;base64,{}", STANDARD.encode(jpeg))
 }

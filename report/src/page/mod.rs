@@ -28,7 +28,6 @@ use model::PageRun;
 /// The data of a page about one run, or about two that are compared.
 #[derive(Debug, Serialize)]
 pub struct ReportPage {
-    /// Name and version of the program.
     made_by: String,
     /// One run, or two that are compared.
     runs: Vec<PageRun>,

@@ -97,7 +97,6 @@ pub(crate) struct TriggerEvent {
     pub(crate) pictures: Vec<usize>,
 }
 
-/// A wake that ended in a fault.
 #[derive(Debug, Serialize)]
 pub(crate) struct FaultEvent {
     pub(crate) t: f64,
@@ -136,7 +135,6 @@ pub(crate) struct PageClip {
     pub(crate) span_ns: [i64; 2],
     pub(crate) bytes: u64,
     pub(crate) triggers: u64,
-    /// Contents of the clip, as text.
     pub(crate) contents: String,
     /// Reasons why it lacks data of its window.
     pub(crate) incomplete: Vec<String>,
@@ -175,7 +173,6 @@ pub(crate) struct PagePicture {
     pub(crate) source: String,
     /// Time from the picture to the trigger, in s; `None` for a thumbnail of a clip.
     pub(crate) age: Option<f64>,
-    /// A `data:` address.
     pub(crate) src: String,
 }
 

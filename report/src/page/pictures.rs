@@ -14,7 +14,6 @@ use super::html::jpeg_address;
 use super::model::{PageClip, PagePicture, TriggerEvent};
 use crate::format::{cut, seconds};
 
-/// Byte budget for all pictures on a page.
 const ALL_BYTES: usize = 2 << 20;
 
 const THUMBNAILS_MAX: usize = 200;
@@ -112,7 +111,6 @@ impl<'a> Pictures<'a> {
         Some(self.shown.len() - 1)
     }
 
-    /// Returns a note on pictures that cannot be read.
     pub(super) fn note(&self) -> Option<String> {
         let (first, count) = self.refused.as_ref()?;
         Some(match count {

@@ -38,7 +38,6 @@ impl Out {
         fs::write(path, content).unwrap();
     }
 
-    /// Writes these as `decisions.jsonl`.
     pub(crate) fn decisions(&self, decisions: &[Value]) {
         self.write(
             "decisions.jsonl",
@@ -65,7 +64,6 @@ pub(crate) fn summary() -> Value {
     })
 }
 
-/// Returns a wake `ms` after the start, with these triggers and this fault.
 pub(crate) fn wake(ms: i64, triggers: Value, fault: Value) -> Value {
     json!({
         "at_ns": START_NS + ms * 1_000_000, "cause": "event", "input": "imu", "topic": "/imu", "writer": null, "seq": ms, "triggers": triggers,

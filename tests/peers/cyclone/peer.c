@@ -5,7 +5,8 @@
 //                [--durability volatile|transient_local]
 //
 // `pub` waits for N readers (1), writes N messages (0: without end) and stays; `sub` reads. Both end
-// with their standard input.
+// with their standard input. With a depth of 0, all messages are kept; then `pub` also prints each
+// change of the number of readers, and whether these acknowledge all messages within 20 s.
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -82,6 +83,13 @@ static void publish(dds_entity_t writer, const struct options *o)
       dds_sleepfor(due - now);
     due += (dds_duration_t)(1e9 / o->rate);
     need(dds_write(writer, message) == DDS_RETCODE_OK, "cannot write");
+    const uint32_t before = matched.current_count;
+    need(dds_get_publication_matched_status(writer, &matched) == DDS_RETCODE_OK, "no status");
+    if (o->depth == 0 && matched.current_count != before) {
+      printf("{\"event\":\"matched\",\"count\":%u}\n", matched.current_count);
+      bool all = dds_wait_for_acks(writer, DDS_SECS(20)) == DDS_RETCODE_OK;
+      printf("{\"event\":\"acked\",\"all\":%s}\n", all ? "true" : "false");
+    }
     if (stdin_ended(0))
       return;
   }

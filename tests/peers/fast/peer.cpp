@@ -5,7 +5,8 @@
 //             [--reliability reliable|best_effort] [--durability volatile|transient_local]
 //
 // `pub` waits for N readers (1), writes N messages (0: without end) and stays; `sub` reads. Both end
-// with their standard input.
+// with their standard input. With a depth of 0, all messages are kept; then `pub` also prints each
+// change of the number of readers, and whether these acknowledge all messages within 20 s.
 #include <chrono>
 #include <cstdio>
 #include <cstdlib>
@@ -239,6 +240,13 @@ void publish(DomainParticipant *participant, Topic *topic, const Options &o)
     std::this_thread::sleep_until(due);
     due += std::chrono::nanoseconds(static_cast<int64_t>(1e9 / o.rate));
     need(writer->write(message.get()), "cannot write");
+    const int32_t before = matched.current_count;
+    writer->get_publication_matched_status(matched);
+    if (o.depth == 0 && matched.current_count != before) {
+      std::printf("{\"event\":\"matched\",\"count\":%d}\n", matched.current_count);
+      const bool all = writer->wait_for_acknowledgments({20, 0}) == ReturnCode_t::RETCODE_OK;
+      std::printf("{\"event\":\"acked\",\"all\":%s}\n", all ? "true" : "false");
+    }
     if (stdin_ended(0))
       return;
   }

@@ -39,6 +39,12 @@ pub enum PeerEvent {
         /// The current number.
         count: u32,
     },
+    /// Readers have acknowledged all messages, or one has not in time: of a writer that keeps all,
+    /// after each change of their number.
+    Acked {
+        /// True if all have.
+        all: bool,
+    },
     /// All requested messages were written.
     Written {
         /// Their number.

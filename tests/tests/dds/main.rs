@@ -9,6 +9,7 @@ mod counted;
 mod faults;
 mod from_peers;
 mod graph;
+mod let_go;
 mod real_time;
 mod receiver;
 mod rtps;
@@ -56,6 +57,7 @@ fn main() -> ExitCode {
         graph::CASES,
         faults::CASES,
         together::CASES,
+        let_go::CASES,
         counted::CASES,
         real_time::CASES,
     ];

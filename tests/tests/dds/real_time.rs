@@ -6,7 +6,7 @@ use std::process::{Command, Stdio};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
-use gleaner_tests::live::{PATIENCE, RunningProgram, descendants, run, run_all, run_by};
+use gleaner_tests::live::{PATIENCE, RunningProgram, descendants, run_all, run_by};
 use gleaner_tests::vehicle::TestVehicle;
 use gleaner_tests::{LambdaCopy, TempFolder, program, root};
 use gleaner_vitals::usage::ProcessUsage;
@@ -44,8 +44,12 @@ pub fn unavailable() -> Option<&'static str> {
 fn ingress_alone() -> Result<(), Failed> {
     let out = TempFolder::new();
     let lambda = root().join("tests/lambdas/ticker/python");
-    let running = run(&lambda, out.path(), &["--no-record", "--real-time"]);
+    // That of the starter is kept by none.
+    let mut gleaner = Command::new("chrt");
+    gleaner.args(["-f", "2"]).arg(program("gleaner"));
+    let running = run_by(gleaner, &[&lambda], out.path(), &["--no-record", "--real-time"]);
     running.until_ready();
+    assert_eq!(policies(running.pid()), BTreeSet::from([FIFO.to_owned()]));
     let mut names = BTreeSet::new();
     for pid in descendants(running.pid(), "") {
         let process = |file| fs::read_to_string(format!("/proc/{pid}/{file}")).unwrap();

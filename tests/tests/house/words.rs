@@ -14,7 +14,6 @@ const PRIVATE_OPENINGS_MAX: usize = 0;
 /// some.
 const WORDS_MAX: usize = 0;
 
-/// Columns of code and comments.
 const CODE_COLUMNS: usize = 100;
 
 /// Columns of pages, but for tables and blocks.

@@ -8,6 +8,7 @@ mod check;
 mod cli;
 mod compile;
 mod cookbook;
+mod denied;
 mod dev;
 mod engines;
 mod environment;

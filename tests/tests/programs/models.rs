@@ -2,14 +2,18 @@
 //! and of the process that runs them if it is killed.
 
 use std::path::Path;
+use std::process::Command;
 use std::time::{Duration, Instant};
 
 use gleaner_protocol::Report;
 use gleaner_tests::live::{
-    JsonReport, RunningProgram, decisions, descendants, run_all, signal, summary,
+    JsonReport, RunningProgram, decisions, descendants, run_by, signal, summary,
 };
-use gleaner_tests::{LambdaCopy, TempFolder, gleaner, replay, root, sample_drive};
+use gleaner_tests::{LambdaCopy, TempFolder, gleaner, program, replay, root, sample_drive};
 use serde_json::Value;
+
+#[path = "../../../host/inference/tests/suite/onnx.rs"]
+mod onnx;
 
 const DETECTOR: &str = "examples/yolo-detector/rust";
 
@@ -22,6 +26,20 @@ const FAULTED: i32 = 6;
 
 /// SHA-256 of the text `no model`.
 const NO_MODEL: &str = "f62c7d17e241fe5c5c0c64d2e32ab6e3bd10547a9c02977cc126acc0fe6e6554";
+
+/// SHA-256 of [`bomb`].
+const BOMB: &str = "22bb103fdde8bfe0e9c4ea5770295a6efefafe90b41ca932c9f19a82b56bd780";
+
+/// Returns a model with a constant of 64 GiB, which rten computes when it loads the model.
+fn bomb() -> Vec<u8> {
+    use onnx::{ANY, FLOAT32, INT64, constant, graph, model, node, value};
+    let nodes =
+        [node("ConstantOfShape", &["n"], &["y0"], &[]), node("Add", &["y0", "x"], &["y"], &[])];
+    let side = (1_i64 << 17).to_le_bytes();
+    let sides = constant("n", INT64, &[2], &[side, side].concat());
+    let output = value("y", FLOAT32, &[ANY, ANY]);
+    model(&graph(&nodes, &[sides], &[value("x", FLOAT32, &[1])], &[output]))
+}
 
 fn detector(change: impl Fn(String) -> String) -> LambdaCopy {
     LambdaCopy::changed_and_named(DETECTOR, "yolo-detector", |manifest| {
@@ -103,7 +121,10 @@ fn start(lambdas: &[&LambdaCopy], out: &TempFolder, args: &[&str]) -> RunningPro
     let drive = sample_drive();
     let lambdas: Vec<&Path> = lambdas.iter().map(|lambda| lambda.path()).collect();
     let drive = ["--drive", drive.to_str().expect("the checkout has a plain path")];
-    run_all(&lambdas, out.path(), &[&drive, args].concat())
+    let mut command = Command::new(program("gleaner"));
+    // The trace of a process that a model has ended takes longer than all else.
+    command.env("RUST_BACKTRACE", "0");
+    run_by(command, &lambdas, out.path(), &[&drive, args].concat())
 }
 
 #[test]
@@ -147,6 +168,39 @@ fn a_run_beyond_model_time_fails_with_the_way_out() {
         let cause = "took longer than the 1ms of `model_time`: raise it in [limits]";
         assert!(fault.message.contains(cause), "{}", fault.message);
     }
+}
+
+#[test]
+fn a_load_that_kills_its_process_harms_no_model_beside_it() {
+    let victim = detector(|it| it);
+    let digest = "e8af074932d4ed7e232278e3055cefcdea3edf178874a3694ae292649fb464dd";
+    let hostile = LambdaCopy::changed_and_named(DETECTOR, "hostile", |manifest| {
+        let manifest = manifest.replace(digest, BOMB);
+        manifest.replace("layout =", "providers = [\"rten\"]\nlayout =")
+    });
+    hostile.replace("models/yolox_nano.onnx", bomb());
+    let out = TempFolder::new();
+    let args = ["--set", "yolo-detector.classes=car, truck", "--no-record", "--all"];
+    let started = start(&[&victim, &hostile], &out, &args);
+    let refused = "is refused: gleaner-inference ended 3 times while it was loaded for `hostile`";
+    let deadline = Instant::now() + Duration::from_secs(120);
+    let mut stderr = String::new();
+    while !stderr.contains(refused) {
+        assert!(Instant::now() < deadline, "{stderr}");
+        std::thread::sleep(Duration::from_millis(10));
+        stderr += &started.stderr();
+    }
+    started.until_named("a decision of the other one", |_, report| match report {
+        Report::Decision(it) => (it.model_ns > 0).then_some(()),
+        _ => None,
+    });
+    started.signal("TERM");
+    stderr += &started.finish().stderr;
+    let restarts = |line: &&str| line.contains("gleaner-inference") && line.contains("restarting");
+    assert_eq!(stderr.lines().find(restarts), None);
+    let decisions = decisions(&out.path().join("yolo-detector"));
+    let faults: Vec<_> = decisions.iter().filter_map(|it| it.fault.as_ref()).collect();
+    assert!(faults.is_empty(), "{faults:?}");
 }
 
 #[test]
@@ -200,4 +254,23 @@ fn a_killed_process_of_models_is_started_again_and_no_lambda_is_lost() {
         let message = &fault.message;
         assert!(message.contains("gleaner-inference"), "{message}");
     }
+}
+
+#[test]
+fn a_process_of_models_that_stands_still_is_replaced() {
+    let (lambda, out) = (detector(|it| it), TempFolder::new());
+    let started = start(&[&lambda], &out, &["--no-record", "--all"]);
+    started.until_ready();
+    let process = || descendants(started.pid(), "gleaner-inference");
+    let [stopped] = process()[..] else { panic!("{:?}", process()) };
+    signal(stopped, "STOP");
+    let deadline = Instant::now() + Duration::from_secs(60);
+    let mut stderr = String::new();
+    while !stderr.contains("gleaner-inference stood still, and was killed") {
+        assert!(Instant::now() < deadline, "{stderr}");
+        std::thread::sleep(Duration::from_millis(10));
+        stderr += &started.stderr();
+    }
+    assert!(!process().contains(&stopped));
+    drop(started.interrupt());
 }

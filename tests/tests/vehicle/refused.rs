@@ -6,6 +6,7 @@ use std::net::TcpStream;
 use std::os::unix::fs::PermissionsExt;
 
 use gleaner_protocol::supervision::{EventKind, LambdaPhase};
+use gleaner_tests::denied::without;
 use gleaner_tests::vehicle::{TestVehicle, text};
 
 use super::{PythonLambda, events, files, ticker};
@@ -38,6 +39,29 @@ pub fn signatures() {
     // What runs is as before.
     assert_eq!(vehicle.deployment("ticker").release, 7);
     assert_eq!(vehicle.deployment("ticker").status.expect("it runs").restarts, 0);
+}
+
+/// Its process cannot be sandboxed, as in a container: the machine is at fault.
+pub fn seccomp() {
+    let mut vehicle = TestVehicle::new();
+    let lambda = ticker("rust", "ticker");
+    without(libc::SYS_seccomp, || {
+        vehicle.start();
+        let deployed = text(&vehicle.deploy(lambda.path(), &["--timeout", "1s"]));
+        assert!(!deployed.contains("repair the lambda"), "{deployed}");
+        // More starts than an end before it is ready would be forgiven.
+        let status = vehicle.until("further starts", |vehicle| {
+            vehicle.deployment("ticker").status.filter(|status| status.restarts > 3)
+        });
+        assert_ne!(status.phase, LambdaPhase::Quarantined);
+        let reason = status.last_end.unwrap_or_default();
+        assert!(reason.contains("`system calls` does not hold"), "{reason}");
+        let shown = text(&vehicle.gleaner(&["status"]));
+        assert!(shown.contains("`system calls` does not hold"), "{shown}");
+        vehicle.stop();
+    });
+    vehicle.start();
+    vehicle.until_running(&["ticker"]);
 }
 
 pub fn changed_file() {

@@ -14,10 +14,8 @@ use crate::examples::DRIVE;
 use crate::private_folder::PrivateFolder;
 use crate::steps;
 
-/// Result folder in the checkout.
 pub(super) const OUT: &str = "out/aarch64";
 
-/// A lambda with settings.
 pub(super) struct ReplayCase {
     lambda: &'static str,
     set: &'static [&'static str],
@@ -25,7 +23,6 @@ pub(super) struct ReplayCase {
     limit: Option<&'static str>,
     /// End of the replay, in seconds of the drive.
     to: Option<&'static str>,
-    /// True to set `deterministic` in its manifest.
     deterministic: bool,
     /// Reason why its decisions must differ, which also proves that differences are found.
     pub(super) known_difference: Option<&'static str>,

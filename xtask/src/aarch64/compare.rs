@@ -14,7 +14,6 @@ use crate::steps::cannot;
 pub(super) struct ReplayResults {
     /// One decision for each wake, without its run time.
     pub(super) decisions: Vec<Map<String, Value>>,
-    /// Duration of the replay.
     pub(super) seconds: f64,
     /// Contents of the other files that have to be equal, by path in the folder.
     files: BTreeMap<PathBuf, Vec<u8>>,

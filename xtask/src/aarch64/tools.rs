@@ -55,7 +55,6 @@ impl Tools {
         cargo
     }
 
-    /// As [`cargo`](Self::cargo), with the tools for the player.
     pub(super) fn cargo_with_player(&self, checkout: &Checkout) -> Result<Command, Failure> {
         let mut cargo = player::cargo(checkout, COMPILER)?;
         self.set_environment(&mut cargo);
@@ -135,7 +134,6 @@ fn libraries(checkout: &Checkout) -> Result<Option<PathBuf>, Failure> {
     Ok(loader.and_then(|loader| Some(loader.parent()?.parent()?.to_owned())))
 }
 
-/// Quotes `path` for a shell.
 fn quoted(path: &Path) -> String {
     format!("'{}'", path.display().to_string().replace('\'', r"'\''"))
 }

@@ -16,7 +16,6 @@ use crate::steps;
 const SCRIPTS: [&str; 3] = ["postinst", "prerm", "postrm"];
 
 pub(crate) struct PackagedCommit {
-    /// Version of all packages of it.
     pub(crate) version: String,
     /// Its time, in s since 1970: files of packages get it, so that the same files become the same
     /// package.
@@ -81,7 +80,6 @@ impl PackageMetadata {
         format!("{}_{}_{}.deb", self.source.name, self.commit.version, self.architecture.name())
     }
 
-    /// Writes Debian's changelog: one entry for this package.
     pub(super) fn write_changelog(
         &self,
         checkout: &Checkout,
@@ -100,7 +98,6 @@ impl PackageMetadata {
         tree.write(&format!("{}/changelog", self.source.doc()), &entry).map(drop)
     }
 
-    /// Writes the folder `DEBIAN`.
     pub(super) fn write(&self, checkout: &Checkout, tree: &PackageTree) -> Result<(), Failure> {
         let files = tree.files()?;
         let kib = |file: &Path| file.metadata().map_or(0, |data| data.len().div_ceil(1024));

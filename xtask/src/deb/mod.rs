@@ -57,7 +57,6 @@ pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, F
     Ok(Exit::Ok)
 }
 
-/// Steps for each package.
 const STEPS: usize = 3;
 pub(crate) const ALL_STEPS: usize = PACKAGES.len() * STEPS;
 
@@ -72,7 +71,6 @@ pub(crate) fn packages(
     PACKAGES.iter().map(build).collect()
 }
 
-/// Checks that the tools for packages of `architecture` are installed.
 pub(crate) fn check_tools(checkout: &Checkout, architecture: Architecture) -> Result<(), Failure> {
     let strip = architecture.strip();
     steps::require(checkout, &[("dpkg-deb", "dpkg"), ("gzip", "gzip"), (strip, "binutils")])

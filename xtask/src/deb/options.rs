@@ -11,16 +11,13 @@ use crate::architecture::Architecture;
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) struct PackageOptions {
     pub(crate) architecture: Architecture,
-    /// Folder for the files.
     pub(crate) out: Option<PathBuf>,
-    /// Folder with the built programs.
     pub(crate) programs: Option<PathBuf>,
     pub(crate) install: bool,
     pub(crate) test: bool,
 }
 
 impl PackageOptions {
-    /// Parses the options that `usage` has in brackets.
     pub(crate) fn parse(arguments: &[OsString], usage: &str) -> Result<Self, Failure> {
         let refuse = |message: &str, help: &str| Failure::new(Exit::Usage, message).with_help(help);
         let unknown = || refuse("the command does not take these arguments", usage);

@@ -2,14 +2,11 @@
 
 use crate::setup;
 
-/// A package of programs and their files.
 pub(crate) struct PackageSource {
     pub(crate) name: &'static str,
     /// Folder of its files that are not built.
     pub(crate) folder: &'static str,
-    /// Built programs with their folders.
     pub(crate) programs: &'static [&'static [(&'static str, &'static str)]],
-    /// Files of `folder` with their places.
     pub(crate) files: &'static [(&'static str, &'static str)],
     /// Packages of cargo whose crates the programs contain.
     pub(crate) cargo_packages: &'static [&'static [&'static str]],
@@ -43,7 +40,6 @@ pub(crate) const VEHICLE_PROGRAMS: [(&str, &str); 11] = [
     (PLAYER, LIB),
 ];
 
-/// Lambdas on a vehicle.
 const VEHICLE: PackageSource = PackageSource {
     name: "gleaner",
     folder: "orchestrator/package",
@@ -86,7 +82,6 @@ const CLOUD: PackageSource = PackageSource {
 pub(super) const PACKAGES: [PackageSource; 2] = [VEHICLE, CLOUD];
 
 impl PackageSource {
-    /// Returns the folder of its documentation.
     pub(super) fn doc(&self) -> String {
         format!("usr/share/doc/{}", self.name)
     }

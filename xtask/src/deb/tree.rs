@@ -166,7 +166,6 @@ impl PackageTree {
         Ok(())
     }
 
-    /// Copies `file` to `place`, with its mode.
     pub(crate) fn place(&self, file: &Path, place: &Path) -> Result<PathBuf, Failure> {
         let to = self.parent(place)?;
         fs::copy(file, &to).map_err(|error| {
@@ -206,8 +205,6 @@ fn entries(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
 
 #[cfg(test)]
 mod tests {
-    use std::path::Path;
-
     use gleaner_lambda::Vehicle;
 
     /// The file of the package with its keys active.
@@ -237,12 +234,5 @@ mod tests {
             lines.map(|key| key.trim().to_owned()).filter(|key| !key.is_empty()).collect()
         };
         assert_eq!(keys(&active()), keys(block));
-    }
-
-    #[test]
-    fn the_programs_find_their_parts() {
-        // As in `gleaner-parts`: `<exe>/../lib/gleaner`.
-        let beside = Path::new("/usr/bin").parent().unwrap().join("lib/gleaner");
-        assert_eq!(beside, Path::new("/").join(super::super::source::LIB));
     }
 }

@@ -25,9 +25,7 @@ const PORTS: [u16; 2] = [8080, 8443];
 /// A running cloud. Dropping it ends it.
 pub(super) struct DemoCloud {
     program: Option<Child>,
-    /// Ports for people and for vehicles.
     pub(super) ports: [u16; 2],
-    /// Address for people.
     pub(super) url: String,
 }
 
@@ -74,7 +72,6 @@ impl DemoCloud {
         Ok(cloud)
     }
 
-    /// Ends the cloud in order.
     pub(super) fn stop(mut self) -> Result<(), Failure> {
         self.program.take().map_or(Ok(()), |program| end(program, "gleaner-cloud"))
     }

@@ -90,7 +90,6 @@ impl<'c> DemoVehicle<'c> {
         Ok(vehicle)
     }
 
-    /// Returns a command `gleaner` to the vehicle or the cloud.
     fn command(&self, arguments: &[&str]) -> Command {
         let mut gleaner = self.checkout.command(self.checkout.program("gleaner"));
         gleaner.env("GLEANER_RUN", &self.run).args(arguments);
@@ -113,7 +112,6 @@ impl<'c> DemoVehicle<'c> {
         serde_json::from_slice(&output.stdout).ok()
     }
 
-    /// Waits until `wanted` returns a value for a status.
     pub(super) fn until<T>(
         &self,
         what: &str,
@@ -147,7 +145,6 @@ impl<'c> DemoVehicle<'c> {
         }
     }
 
-    /// Waits until `wanted` returns a value for the status of a deployment.
     pub(super) fn until_lambda<T>(
         &self,
         id: &str,
@@ -185,7 +182,6 @@ pub(super) fn signal(pid: u32, signal: Signal) -> Result<(), Failure> {
         .map_err(|error| Failure::caused_by(Exit::Internal, "cannot signal a process", &error))
 }
 
-/// Asks a program to end, and waits for that.
 pub(super) fn end(mut program: Child, name: &str) -> Result<(), Failure> {
     // Of one that has ended, its number is kept until it is waited for.
     let _ = signal(program.id(), Signal::TERM);

@@ -58,7 +58,6 @@ pub(super) fn run(checkout: &Checkout, examples: &[&Example]) -> Result<bool, Fa
     Ok(agree)
 }
 
-/// Prints which files there are, and what to try next.
 pub(super) fn print_files(checkout: &Checkout) {
     println!(
         "\nfiles: out/demo/EXAMPLE-KIND/ with clips/, clips.jsonl, decisions.jsonl, log.jsonl, \

@@ -42,7 +42,6 @@ const DETECTOR_DEMAND: &str = "\n[demand]\nrate_hz = 10\ncpu = \"5ms\"\nmodel_ti
 /// The topics that the examples read or record.
 const TOPICS: &str = "/camera/front/compressed,/imu/data,/vehicle/speed";
 
-/// Languages of the twins.
 const LANGUAGES: [&str; 2] = ["rust", "python"];
 
 /// The lambda whose process is killed, and the number of its wakes by then: 8 s of the IMU.

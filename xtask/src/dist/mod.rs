@@ -81,7 +81,6 @@ fn check_compilers(checkout: &Checkout, options: &PackageOptions) -> Result<(), 
     }
 }
 
-/// Writes the sums of all files beside them.
 fn write_sums(checkout: &Checkout, out: &Path, files: &[PathBuf]) -> Result<(), Failure> {
     let mut sums = checkout.command("sha256sum");
     sums.current_dir(out).args(files.iter().filter_map(|file| file.file_name()));

@@ -26,11 +26,9 @@ const REPLICAS: usize = 3;
 /// Credentials of the object store, which is on this machine and checks none.
 const KEY: &str = "fleet";
 
-/// The cloud behind its balancer.
 pub(super) struct ScaledCloud {
     pub(super) people: SocketAddr,
     pub(super) vehicles: SocketAddr,
-    /// The one-time code of the administrator.
     pub(super) code: String,
     is_stopping: Arc<AtomicBool>,
     /// In the order in which they are killed.

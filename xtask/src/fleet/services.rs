@@ -23,9 +23,7 @@ pub(super) struct Service {
     pub(super) name: &'static str,
     command: Command,
     child: Child,
-    /// Address at which it listens.
     address: SocketAddr,
-    /// File with its output.
     log: PathBuf,
 }
 

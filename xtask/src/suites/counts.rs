@@ -5,7 +5,6 @@ use std::path::Path;
 #[derive(Debug, Default)]
 pub(super) struct TestCounts {
     pub(super) passed: u64,
-    /// Names of the failed tests.
     pub(super) failed: Vec<String>,
     /// Names of the skipped tests, with their reasons.
     pub(super) skipped: Vec<String>,

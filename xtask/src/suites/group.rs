@@ -21,7 +21,6 @@ const GRACE: Duration = Duration::from_secs(15);
 const LOOK_INTERVAL: Duration = Duration::from_millis(100);
 
 pub(super) struct SuiteBounds {
-    /// The longest time of a suite.
     time: Duration,
     /// Set when all suites are to end.
     is_interrupted: Arc<AtomicBool>,
@@ -40,7 +39,6 @@ impl SuiteBounds {
         }
     }
 
-    /// Returns whether no other suite is to begin.
     pub(super) fn is_interrupted(&self) -> bool {
         self.is_interrupted.load(Ordering::Relaxed)
     }

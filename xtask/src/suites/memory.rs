@@ -11,14 +11,12 @@ use std::{env, io, process};
 use rustix::fs::{FlockOperation, OFlags, StatVfsMountFlags, flock, statvfs};
 
 const SHARED_MEMORY: &str = "/dev/shm";
-/// Prefix of the folder names.
 const NAME: &str = "gleaner-tests-";
 /// Required free space: one test fills 4 GiB, and others run beside it.
 const SPACE_BYTES: u64 = 8 << 30;
 /// Memory that must remain for programs if that space is used.
 const PROGRAM_BYTES: u64 = 4 << 30;
 
-/// A folder in memory, removed on drop.
 pub(super) struct MemoryFolder {
     path: PathBuf,
     /// Lock on the folder. The system releases it if this process is killed.

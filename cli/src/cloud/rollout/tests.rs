@@ -8,7 +8,6 @@ fn rollout(goal: Goal) -> Rollout {
     Rollout { id, selector: Selector::new(), envelope, goal, plan: FleetPlan::default() }
 }
 
-/// A status with these deployments, each of which has these fields.
 fn status(deployments: &[Value]) -> VehicleStatus {
     let mut all = Vec::new();
     for fields in deployments {

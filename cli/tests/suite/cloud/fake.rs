@@ -13,12 +13,9 @@ use axum::response::{IntoResponse, Response};
 use serde_json::{Value, json};
 use tokio::net::{TcpListener, UnixListener};
 
-/// A request.
 #[derive(Clone, Debug)]
 pub struct SeenRequest {
-    /// Method and path.
     pub line: String,
-    /// Value of the header `Authorization`.
     pub authorization: Option<String>,
     pub body: Vec<u8>,
 }
@@ -31,14 +28,12 @@ struct Table {
     sent: String,
 }
 
-/// The server. It ends with the process.
 pub struct FakeServer {
     table: Arc<Mutex<Table>>,
     address: Option<SocketAddr>,
 }
 
 impl FakeServer {
-    /// Serves as a cloud.
     pub fn on_tcp() -> Self {
         let (sender, receiver) = mpsc::channel();
         let serve = async move |router: Router| {
@@ -50,7 +45,6 @@ impl FakeServer {
         Self { table, address: Some(receiver.recv().unwrap()) }
     }
 
-    /// Serves as an orchestrator at the socket `path`.
     pub fn on_socket(path: &Path) -> Self {
         let (sender, receiver) = mpsc::channel();
         let path = path.to_owned();
@@ -87,7 +81,6 @@ impl FakeServer {
         self.table.lock().unwrap().answers.insert(line.to_owned(), answers);
     }
 
-    /// Returns the answer that is set for a request.
     pub fn answer(&self, line: &str) -> Value {
         self.table.lock().unwrap().answers[line][0].1.clone()
     }
@@ -98,7 +91,6 @@ impl FakeServer {
     }
 }
 
-/// Returns a problem, as a server reports it.
 pub fn problem(exit: u8, title: &str) -> Value {
     json!({ "title": title, "causes": ["a cause"], "help": "a help", "exit": exit })
 }

@@ -91,7 +91,6 @@ impl CloudUser {
         digest
     }
 
-    /// Sets the vehicles of the cloud, each with its labels.
     fn vehicles(&self, vehicles: &[(&str, &str, Value)]) {
         let vehicles = vehicles.iter().map(|(name, state, labels)| {
             json!({
@@ -404,7 +403,6 @@ fn a_deployment_of_a_fleet_is_listed_changed_and_removed() {
     assert!(text.contains("the cloud has no deployment `other`"), "{text}");
 }
 
-/// The deployment in the cloud, with waves in this state.
 fn in_waves(release: u64, wave: u64, state: &str, reason: &str) -> Value {
     let mut deployment = in_cloud(release);
     deployment["waves"] = json!({

@@ -15,7 +15,6 @@ use tempfile::TempDir;
 use crate::programs;
 use fake::FakeServer;
 
-/// A folder of a user, and the cloud.
 struct CloudUser {
     folder: TempDir,
     cloud: FakeServer,

@@ -9,7 +9,6 @@ use super::CloudUser;
 use super::fake::{FakeServer, problem};
 use crate::programs::{self, fails};
 
-/// Returns a status of a vehicle with these deployments.
 pub fn status(deployments: &[Value]) -> Value {
     json!({
         "vehicle": "car-7", "key": "k", "labels": {}, "generation": 1, "capacity": [],
@@ -102,12 +101,14 @@ fn listed_events_are_in_the_order_of_boots_and_end_no_line_and_move_no_cursor() 
     (other["kind"], other["record"]) = (json!("other"), json!(hostile));
     let mut gap = line(("", 0), 0, "gap", "");
     (gap["kind"], gap["record"]) = (json!("other"), json!("gap"));
+    let mut of_another_stream = line(("b", 1), first, "b", "c");
+    of_another_stream["stream"] = json!("orchestrator");
     // The second start of the machine had an earlier clock.
     let all = [
         line(("b", 2), second, "ready", hostile),
         other.clone(),
         gap,
-        line(("b", 1), first, "b", "c"),
+        of_another_stream,
         line(("d", 1), 1_000_000_000, "d", "e"),
     ];
     let lines = all.map(|line| line.to_string() + "\n").concat();

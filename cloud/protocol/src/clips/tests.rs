@@ -13,12 +13,12 @@ fn a_name_is_safe_as_a_part_of_a_path() {
 }
 
 #[test]
-fn parts_end_with_the_file() {
+fn pieces_end_with_the_file() {
     let bytes = 2 * CLIP_PART + 5;
-    let lengths: Vec<_> = (0..4).map(|part| ClipFacts::part_length(bytes, part)).collect();
-    assert_eq!(lengths, [Some(CLIP_PART), Some(CLIP_PART), Some(5), None]);
-    assert_eq!(ClipFacts::part_length(CLIP_PART, 1), None);
-    assert_eq!(ClipFacts::part_length(5, u64::MAX), None);
+    let length = |begin| ClipFacts::piece_length(bytes, begin);
+    assert_eq!([0, 1, CLIP_PART + 5].map(length), [Some(CLIP_PART); 3]);
+    assert_eq!([bytes - 5, bytes - 1].map(length), [Some(5), Some(1)]);
+    assert_eq!([bytes, u64::MAX].map(length), [None; 2]);
 }
 
 fn facts() -> ClipFacts {

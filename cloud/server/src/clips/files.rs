@@ -1,9 +1,8 @@
 //! Files of clips, under names that are digests of their ids.
 //!
-//! In a folder, the parts of a file are appended to it one after the other, each once it is
-//! complete and its digest is right; in a bucket, each part is an object with its digest in the
-//! name: a part that comes to another replica replaces none. Which parts count is in the database
-//! only.
+//! Parts have any length: as much of a request as has come. In a folder, they are appended to the
+//! file one after the other; in a bucket, each is an object with its digest in the name: a part
+//! that comes to another replica replaces none. Which parts count is in the database only.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -11,12 +10,13 @@ use std::io::{self, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{self, Arc, PoisonError};
+use std::time::Duration;
 
 use axum::body::Body;
 use futures_util::stream::try_unfold;
 use futures_util::{StreamExt, TryStreamExt};
 use gleaner_base::sync_folder;
-use gleaner_fleet::clips::{CLIP_PART, ClipId};
+use gleaner_fleet::clips::ClipId;
 use gleaner_fleet::{AnnouncedFile, UnfinishedFile};
 use gleaner_trust::sha256;
 use tokio::sync::{Mutex, OwnedMutexGuard, OwnedSemaphorePermit, Semaphore};
@@ -25,19 +25,22 @@ use tokio::time::timeout;
 use crate::error::{CloudError, CloudResult};
 use crate::folder::PART;
 use crate::place::{FilePlace, blocking};
-use crate::store::ClipBounds;
-use crate::transfer::{IncomingFile, PIECE_TIME, StoredBytes};
+use crate::store::{ClipBounds, ClipProgress, StoredPart};
+use crate::transfer::{IncomingFile, PIECE_TIME, ReceivedPiece, StoredBytes};
 
 /// Number of parts of a vehicle that are received at a time: some may be of connections that it
 /// has lost.
 const PARTS_MAX: usize = 4;
+/// Time without any byte after which a piece ends: sooner than a vehicle notices that a connection
+/// is dead, and asks where to go on.
+const SILENCE: Duration = Duration::from_secs(15);
 /// Number of locks for all files.
 const TURNS: usize = 64;
 
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum FileOfClip {
-    /// The recording, of this length, with the SHA-256 of each part.
-    Recording(u64, Vec<String>),
+    /// The recording, of this length, with its parts.
+    Recording(u64, Vec<StoredPart>),
     Thumbnail,
 }
 
@@ -63,10 +66,14 @@ impl ClipFiles {
     }
 
     /// Returns whether any of the recording of a clip is there.
-    pub(crate) async fn has_recording(&self, id: &ClipId, parts: &[String]) -> io::Result<bool> {
+    pub(crate) async fn has_recording(
+        &self,
+        id: &ClipId,
+        parts: &[StoredPart],
+    ) -> io::Result<bool> {
         let name = match (self.place.is_bucket(), parts.first()) {
             (false, _) => recording(id),
-            (true, Some(first)) => part_name(id, 0, first),
+            (true, Some(first)) => part_name(id, 0, &first.sha256),
             (true, None) => return Ok(false),
         };
         Ok(self.place.length(&name).await?.is_some())
@@ -103,27 +110,32 @@ impl ClipFiles {
     fn parts_from(
         self: &Arc<Self>,
         id: &ClipId,
-        (length, digests): (u64, Vec<String>),
+        (length, parts): (u64, Vec<StoredPart>),
         begin: u64,
     ) -> Body {
-        let start = (Arc::clone(self), id.clone(), digests, begin);
-        let parts = try_unfold(start, move |(files, id, digests, begin)| async move {
+        let mut end = 0;
+        let parts = parts.into_iter().zip(0..).map(move |(part, number)| {
+            end += part.bytes;
+            (number, end - part.bytes, part)
+        });
+        let (files, id) = (Arc::clone(self), id.clone());
+        let parts = parts.filter(move |(_, at, part)| at + part.bytes > begin);
+        let start = (files, id, parts, begin);
+        let parts = try_unfold(start, move |(files, id, mut parts, begin)| async move {
             if begin >= length {
                 return io::Result::Ok(None);
             }
-            let (number, skipped) = (begin / CLIP_PART, begin % CLIP_PART);
             let lost = || io::Error::from(io::ErrorKind::NotFound);
-            let digest = usize::try_from(number).ok().and_then(|number| digests.get(number));
-            let digest = digest.ok_or_else(lost)?.clone();
-            let part = files.place.content(&part_name(&id, number, &digest), skipped).await?;
+            let (number, at, StoredPart { sha256, bytes }) = parts.next().ok_or_else(lost)?;
+            let (skipped, end) = (begin - at, at + bytes);
+            let part = files.place.content(&part_name(&id, number, &sha256), skipped).await?;
             let part = part.ok_or_else(lost)?;
             // A longer or shorter one would move all that follows.
-            let end = length.min((number + 1) * CLIP_PART);
             let stored = StoredBytes::new(&format!("part {number} of clip `{id}`"), end - begin);
-            let stored = if skipped == 0 { stored.with_sha256(&digest) } else { stored };
+            let stored = if skipped == 0 { stored.with_sha256(&sha256) } else { stored };
             let pieces = stored.checked(part).into_data_stream();
             let pieces = pieces.map(|it| it.map_err(io::Error::other));
-            Ok(Some((pieces, (files, id, digests, (number + 1) * CLIP_PART))))
+            Ok(Some((pieces, (files, id, parts, end))))
         });
         Body::from_stream(parts.try_flatten())
     }
@@ -155,17 +167,18 @@ impl ClipFiles {
         Arc::clone(&self.turns[index]).lock_owned().await
     }
 
-    /// Receives bytes with this length and SHA-256 into a file of their own.
+    /// Receives at most so many bytes into a file of their own, as many as come.
     pub(crate) async fn receive(
         &self,
         id: &ClipId,
-        (length, sha256): (u64, &str),
+        length: u64,
         body: Body,
-    ) -> CloudResult<UnfinishedFile> {
+    ) -> CloudResult<ReceivedPiece> {
         let number = self.parts.fetch_add(1, Ordering::Relaxed);
         let path = self.path(id).with_extension(format!("{number}.{PART}"));
         let name = format!("a part of clip `{id}`");
-        IncomingFile { name: &name, length, sha256 }.receive(path, body).await
+        let file = IncomingFile { name: &name, length, sha256: "" };
+        Ok(file.receive_some(SILENCE, path, body).await?.0)
     }
 
     /// Makes a received file durable as the thumbnail of a clip.
@@ -177,19 +190,20 @@ impl ClipFiles {
         self.place.keep(part, &thumbnail(id)).await
     }
 
-    /// Makes a received part durable at its place in the recording of a clip. Returns false if the
-    /// parts before it are not there.
+    /// Makes a received part durable as the next one of the recording of a clip. Returns false if
+    /// the parts before it are not there. Until the database has it, it may come again.
     pub(crate) async fn append(
         &self,
-        id: &ClipId,
-        (number, sha256): (u64, &str),
-        part: UnfinishedFile,
+        progress: &ClipProgress,
+        piece: ReceivedPiece,
     ) -> io::Result<bool> {
+        let ClipProgress { id, part, received, .. } = progress;
         if self.place.is_bucket() {
-            return self.place.keep(&part, &part_name(id, number, sha256)).await.map(|()| true);
+            let name = part_name(id, *part, &piece.sha256);
+            return self.place.keep(&piece.file, &name).await.map(|()| true);
         }
-        let path = self.path(id);
-        blocking(move || append(&path, number, &part)).await
+        let (path, begin) = (self.path(id), *received);
+        blocking(move || append(&path, begin, &piece.file)).await
     }
 
     /// Compares a recording with its announced length and SHA-256; returns the reason if it is
@@ -198,7 +212,7 @@ impl ClipFiles {
         self: &Arc<Self>,
         id: &ClipId,
         (length, sha256): (u64, String),
-        parts: Vec<String>,
+        parts: Vec<StoredPart>,
     ) -> io::Result<Result<(), String>> {
         if !self.place.is_bucket() {
             let path = self.path(id);
@@ -218,9 +232,8 @@ impl ClipFiles {
     }
 }
 
-fn append(path: &Path, number: u64, part: &UnfinishedFile) -> io::Result<bool> {
+fn append(path: &Path, begin: u64, part: &UnfinishedFile) -> io::Result<bool> {
     let mut file = File::options().write(true).create(true).truncate(false).open(path)?;
-    let begin = number * CLIP_PART;
     if file.metadata()?.len() < begin {
         return Ok(false);
     }
@@ -229,7 +242,7 @@ fn append(path: &Path, number: u64, part: &UnfinishedFile) -> io::Result<bool> {
     io::copy(&mut File::open(&part.0)?, &mut file)?;
     file.flush()?;
     file.sync_all()?;
-    if number == 0 {
+    if begin == 0 {
         path.parent().map_or(Ok(()), sync_folder)?;
     }
     Ok(true)

@@ -47,10 +47,15 @@ async fn remove_files(cloud: &Cloud) -> CloudResult<()> {
     }
 }
 
-/// Removes the files of a clip that was removed; returns whether none is left.
+/// Removes the files of a clip that do not count any more; returns whether none is left.
 pub(crate) async fn remove_files_of(cloud: &Cloud, id: ClipId) -> CloudResult<bool> {
     // A part that is being stored ends first, and no other one begins meanwhile.
     let _turn = cloud.clips.turn(&id).await;
+    remove_noted(cloud, id).await
+}
+
+/// As [`remove_files_of`], for the one who has the turn of the clip.
+async fn remove_noted(cloud: &Cloud, id: ClipId) -> CloudResult<bool> {
     // Its vehicle may have announced and sent it again.
     let RemovedClip { id, has_file, has_thumbnail } = cloud.store.removed_clip(id).await?;
     let mut removed = Ok(());
@@ -68,30 +73,17 @@ pub(crate) async fn remove_files_of(cloud: &Cloud, id: ClipId) -> CloudResult<bo
     Ok(true)
 }
 
-/// Removes recordings whose parts do not count any more.
-async fn remove_recordings(cloud: &Cloud, ids: &[ClipId]) {
-    for id in ids {
-        let _turn = cloud.clips.turn(id).await;
-        if let Err(error) = cloud.clips.remove_recording(id).await {
-            tracing::warn!(clip = %id, %error, "a file cannot be removed");
-        }
-    }
-}
-
 /// Removes old clips, and unfinished files that are not continued, for as long as the program runs.
 pub(crate) async fn clean(cloud: Arc<Cloud>) {
     let mut looks = interval(CLEANING);
     loop {
         looks.tick().await;
+        let forgotten = cloud.store.forget_unfinished_clips(cloud.clips.bounds.unfinished_s).await;
+        if let Err(error) = forgotten {
+            tracing::warn!(reason = error.reason(), "unfinished clips are not removed");
+        }
         if let Err(error) = remove_expired(&cloud).await {
             tracing::warn!(reason = error.reason(), "old clips are not removed");
-        }
-        let forgotten = cloud.store.forget_unfinished_clips(cloud.clips.bounds.unfinished_s).await;
-        match forgotten {
-            Ok(forgotten) => remove_recordings(&cloud, &forgotten).await,
-            Err(error) => {
-                tracing::warn!(reason = error.reason(), "unfinished clips are not removed");
-            }
         }
     }
 }

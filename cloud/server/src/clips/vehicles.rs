@@ -2,6 +2,7 @@
 
 use std::io;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use axum::Json;
@@ -10,22 +11,21 @@ use axum::body::{Body, Bytes};
 use axum::extract::{DefaultBodyLimit, Path};
 use axum::middleware::from_fn;
 use axum::routing::{post, put};
-use futures_util::StreamExt;
+use futures_util::{StreamExt, TryStreamExt};
 use gleaner_base::{Exit, Failure};
-use gleaner_fleet::UnfinishedFile;
 use gleaner_fleet::clips::{
-    CLIP_PART, CLIP_REPORT_MAX, CLIPS_IN_REPORT, ClipFacts, ClipId, ClipName, ClipOrders,
-    ClipReport, THUMBNAIL_MAX,
+    CLIP_PART, CLIP_PIECE_MIN, CLIP_REPORT_MAX, CLIPS_IN_REPORT, ClipFacts, ClipId, ClipName,
+    ClipOrders, ClipReport, THUMBNAIL_MAX,
 };
 use gleaner_image::Format;
-use gleaner_lambda::manifest::Sha256;
 use tokio::time::timeout;
 
-use super::remove_recordings;
+use super::remove_noted;
 use crate::cloud::{Call, Cloud};
 use crate::error::{CloudError, CloudResult};
 use crate::request::{digest, in_time, parsed};
-use crate::store::ClipProgress;
+use crate::store::{ClipProgress, StoredPart};
+use crate::transfer::ReceivedPiece;
 use crate::vehicles::KnownVehicle;
 
 /// Time for a part that is not wanted.
@@ -45,6 +45,7 @@ pub(crate) fn router() -> Router<Arc<Cloud>> {
     Router::new()
         .route("/v1/clips", report.layer(from_fn(in_time)))
         .route("/v1/clips/{name}/thumbnail", thumbnail.layer(from_fn(in_time)))
+        .route("/v1/clips/{name}/from/{begin}", put(piece))
         .route("/v1/clips/{name}/parts/{part}/{sha256}", put(part))
 }
 
@@ -71,8 +72,7 @@ async fn report(
     }
     let bounds = cloud.clips.bounds;
     if report != ClipReport::default() {
-        let dropped = cloud.store.announce_clips(&vehicle.name, &report, bounds).await?;
-        remove_recordings(&cloud, &dropped).await;
+        cloud.store.announce_clips(&vehicle.name, &report, bounds).await?;
     }
     orders(&cloud, &vehicle.name).await
 }
@@ -87,29 +87,30 @@ async fn thumbnail(
     body: Bytes,
 ) -> CloudResult<Json<ClipOrders>> {
     let name = clip_name(&name)?;
+    let length = body.len() as u64;
+    let file = format!("the thumbnail of clip `{name}`");
+    let file = (&*file, Some(THUMBNAIL_MAX));
+    let fits = cloud.store.must_fit(&vehicle.name, file, cloud.clips.bounds).await;
+    cloud.store.clip_bytes_arrived(&vehicle.name, length).await?;
     let Some(wanted) = cloud.store.wanted_thumbnail(&vehicle.name, &name).await? else {
         return orders(&cloud, &vehicle.name).await;
     };
+    fits?;
     let id = id(&name, &vehicle.name)?;
-    let refused =
-        |help| CloudError::denied(format!("the thumbnail of clip `{id}` is refused"), help);
-    if gleaner_trust::sha256(&body).as_str() != wanted {
-        return Err(refused("send the JPEG that was announced"));
-    }
-    if !is_thumbnail(&body) {
-        // It will never be another one.
+    if gleaner_trust::sha256(&body).as_str() != wanted || !is_thumbnail(&body) {
+        // It will never be the announced one.
         cloud.store.thumbnail_refused(&id, &wanted).await?;
-        return Err(refused("announce a JPEG of at most 4096 pixels a side"));
+        let help = "announce a JPEG of at most 4096 pixels a side, and send that one";
+        return Err(CloudError::denied(format!("the thumbnail of clip `{id}` is refused"), help));
     }
-    let length = body.len() as u64;
-    let part = cloud.clips.receive(&id, (length, &wanted), Body::from(body)).await?;
+    let part = cloud.clips.receive(&id, length, Body::from(body)).await?;
     let _turn = cloud.clips.turn(&id).await;
     if cloud.store.wanted_thumbnail(&vehicle.name, &name).await?.is_none() {
         // The clip was removed meanwhile, or another request has sent it.
         return orders(&cloud, &vehicle.name).await;
     }
-    cloud.clips.keep_thumbnail(&id, &part).await.map_err(|error| not_stored(&id, error))?;
-    cloud.store.thumbnail_received(&id).await?;
+    cloud.clips.keep_thumbnail(&id, &part.file).await.map_err(|error| not_stored(&id, error))?;
+    cloud.store.thumbnail_received(&id, length).await?;
     orders(&cloud, &vehicle.name).await
 }
 
@@ -121,44 +122,93 @@ pub(crate) fn is_thumbnail(bytes: &[u8]) -> bool {
         })
 }
 
-/// Receives a part. One that was received before changes nothing.
+/// Receives a piece that begins at a byte. What has come of one that breaks off is kept.
+async fn piece(
+    Call(cloud, vehicle): Call<KnownVehicle>,
+    Path((name, begin)): Path<(String, u64)>,
+    body: Body,
+) -> CloudResult<Json<ClipOrders>> {
+    received(cloud, vehicle, (clip_name(&name)?, begin), body).await
+}
+
+/// Receives a part of an older vehicle, as a piece: all of the file is compared at its end.
 async fn part(
     Call(cloud, vehicle): Call<KnownVehicle>,
     Path((name, number, sha256)): Path<(String, u64, String)>,
     body: Body,
 ) -> CloudResult<Json<ClipOrders>> {
-    let (name, sha256) = (clip_name(&name)?, digest(&sha256)?);
-    let expected = expected(&cloud, &vehicle.name, &name, number).await;
-    let Ok(Some((progress, length))) = expected else {
-        // Unread, it could hide the answer from the vehicle.
-        let _ = timeout(UNWANTED_TIME, skip(body)).await;
-        expected?;
-        return orders(&cloud, &vehicle.name).await;
-    };
-    let _slot = cloud.clips.slot(&vehicle.name)?;
-    let received = cloud.clips.receive(&progress.id, (length, sha256.as_str()), body).await?;
-    let working = Arc::clone(&cloud);
+    digest(&sha256)?;
+    let piece = (clip_name(&name)?, number.saturating_mul(CLIP_PART));
+    received(cloud, vehicle, piece, body).await
+}
+
+/// Receives a piece, and counts what arrives, whatever becomes of it. One that was received before
+/// changes nothing.
+async fn received(
+    cloud: Arc<Cloud>,
+    vehicle: KnownVehicle,
+    piece: (ClipName, u64),
+    body: Body,
+) -> CloudResult<Json<ClipOrders>> {
+    let arrived = Arc::new(AtomicU64::new(0));
+    let counter = Arc::clone(&arrived);
+    let pieces = body.into_data_stream().inspect_ok(move |piece| {
+        counter.fetch_add(piece.len() as u64, Ordering::Relaxed);
+    });
+    let (working, name) = (Arc::clone(&cloud), vehicle.name.clone());
     // A vehicle that goes away in the middle must not leave it half done.
-    let stored = tokio::spawn(store_part(working, progress, (length, sha256), received)).await;
-    stored.map_err(|error| {
+    let stored = tokio::spawn(async move {
+        let stored = store_piece(&working, &name, piece, Body::from_stream(pieces)).await;
+        let arrived = arrived.load(Ordering::Relaxed);
+        stored.and(working.store.clip_bytes_arrived(&name, arrived).await)
+    });
+    stored.await.map_err(|error| {
         Failure::caused_by(Exit::Internal, "a part of a clip is not stored", &error)
     })??;
     orders(&cloud, &vehicle.name).await
 }
 
-/// Returns the clip and the length of a part that is the next one; `None` of any other one.
+/// Stores a piece, if some of it comes next.
+async fn store_piece(
+    cloud: &Arc<Cloud>,
+    vehicle: &str,
+    (name, begin): (ClipName, u64),
+    body: Body,
+) -> CloudResult<()> {
+    let expected = expected(cloud, vehicle, &name, begin).await;
+    let Ok(Some((progress, length))) = expected else {
+        // Unread, it could hide the answer from the vehicle.
+        let _ = timeout(UNWANTED_TIME, skip(body)).await;
+        return expected.map(drop);
+    };
+    let _slot = cloud.clips.slot(vehicle)?;
+    // Some of it may have come before.
+    let mut left = progress.received - begin;
+    let length = length - left;
+    let pieces = body.into_data_stream().map_ok(move |mut piece| {
+        let skipped = left.min(piece.len() as u64);
+        left -= skipped;
+        piece.split_off(skipped as usize)
+    });
+    let body = Body::from_stream(pieces);
+    let received = cloud.clips.receive(&progress.id, length, body).await?;
+    append_piece(cloud, progress, received).await
+}
+
+/// Returns the clip and the largest length of a piece, if the next byte is in it.
 async fn expected(
     cloud: &Cloud,
     vehicle: &str,
     name: &ClipName,
-    number: u64,
+    begin: u64,
 ) -> CloudResult<Option<(ClipProgress, u64)>> {
     let progress = cloud.store.clip_progress(vehicle, name, cloud.clips.bounds).await?;
-    let length = ClipFacts::part_length(progress.bytes, number).ok_or_else(|| {
-        let message = format!("clip `{}` has no part {number}", progress.id);
-        CloudError::usage(message, "send the next part of the orders")
+    let length = ClipFacts::piece_length(progress.bytes, begin).ok_or_else(|| {
+        let message = format!("clip `{}` has no byte {begin}", progress.id);
+        CloudError::usage(message, "send the next bytes of the orders")
     })?;
-    Ok((progress.part == number).then_some((progress, length)))
+    let is_next = (begin..begin + length).contains(&progress.received);
+    Ok(is_next.then_some((progress, length)))
 }
 
 /// Reads a body that is not wanted, up to the length of a part.
@@ -172,32 +222,33 @@ async fn skip(body: Body) {
     }
 }
 
-/// Appends a part, and compares the file after the last one.
-async fn store_part(
-    cloud: Arc<Cloud>,
+/// Appends a piece, and compares the file after the last one.
+async fn append_piece(
+    cloud: &Arc<Cloud>,
     progress: ClipProgress,
-    (length, sha256): (u64, Sha256),
-    received: UnfinishedFile,
+    received: ReceivedPiece,
 ) -> CloudResult<()> {
     let id = progress.id.clone();
     let _turn = cloud.clips.turn(&id).await;
     let name = clip_name(id.name())?;
-    let now = cloud.store.clip_progress(id.vehicle(), &name, cloud.clips.bounds).await?;
-    if now != progress {
-        // Another request has stored the part meanwhile.
+    let bounds = cloud.clips.bounds;
+    let now = cloud.store.clip_progress(id.vehicle(), &name, bounds).await?;
+    let is_last = now.received + received.bytes == now.bytes;
+    // Another request may have stored a piece meanwhile. Each costs an entry, and in a bucket an
+    // object.
+    if now != progress || (received.bytes < CLIP_PIECE_MIN && !is_last) {
         return Ok(());
     }
-    let is_last = ClipFacts::part_length(progress.bytes, progress.part + 1).is_none();
     let failed = |error| not_stored(&id, error);
-    let part = (progress.part, sha256.as_str());
-    let is_appended = cloud.clips.append(&id, part, received).await.map_err(failed)?;
+    let part = StoredPart { sha256: received.sha256.clone(), bytes: received.bytes };
+    let is_appended = cloud.clips.append(&now, received).await.map_err(failed)?;
     let outcome = match (is_appended, is_last) {
         (false, _) => Err(NO_PARTS.to_owned()),
         (true, false) => Ok(()),
         (true, true) => {
-            let announced = (progress.bytes, progress.sha256.clone());
+            let announced = (now.bytes, now.sha256.clone());
             let mut parts = cloud.store.clip_parts(&id).await?;
-            parts.push(sha256.to_string());
+            parts.push(part.clone());
             match cloud.clips.compare(&id, announced, parts).await {
                 Err(error) if error.kind() == io::ErrorKind::NotFound => Err(NO_PARTS.to_owned()),
                 compared => compared.map_err(failed)?,
@@ -206,16 +257,16 @@ async fn store_part(
     };
     match outcome {
         Ok(()) => {
-            let part = (length, sha256.as_str());
-            cloud.store.clip_part_received(&progress, part, is_last).await
+            let part = (part.bytes, &*part.sha256);
+            cloud.store.clip_part_received(&now, part, is_last, bounds).await
         }
         Err(reason) => {
             // Otherwise another replica has stored it meanwhile.
             if cloud.store.clip_upload_failed(&id, &reason).await? {
-                cloud.clips.remove_recording(&id).await.map_err(failed)?;
+                remove_noted(cloud, id.clone()).await?;
             }
             let message = format!("the file of clip `{id}` is refused");
-            Err(CloudError::denied(message, "send it again from its first part").because(reason))
+            Err(CloudError::denied(message, "send it again from its first byte").because(reason))
         }
     }
 }

@@ -11,7 +11,6 @@ use super::text::{query, short, shown, time};
 /// Number of entries on a page.
 const SIZE: u64 = 50;
 
-/// The part of the list, as the address has it.
 #[derive(Debug, Deserialize)]
 pub(super) struct AuditPart {
     before: Option<u64>,

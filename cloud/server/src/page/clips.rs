@@ -130,7 +130,6 @@ pub(super) fn image(clip: &FleetClip, words: &str) -> Markup {
     }
 }
 
-/// Returns the labels of a clip, as its title.
 pub(super) fn title(clip: &FleetClip) -> String {
     let mut labels: Vec<&str> = Vec::new();
     for moment in &clip.facts.moments {
@@ -152,7 +151,6 @@ pub(super) fn length(clip: &FleetClip) -> String {
     format!("{:.1} s", clip.facts.to_ns.saturating_sub(clip.facts.from_ns) as f64 / 1e9)
 }
 
-/// Renders the place of the file.
 pub(super) fn state(clip: &FleetClip) -> Markup {
     let (class, words) = match clip.state {
         ClipState::OnVehicle => ("other", "on the vehicle".to_owned()),

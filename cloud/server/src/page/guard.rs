@@ -33,7 +33,6 @@ const HEADERS: [(HeaderName, &str); 6] = [
     (HeaderName::from_static("cross-origin-resource-policy"), "same-origin"),
 ];
 
-/// The fields of a form that was accepted.
 #[derive(Debug, Clone, Default)]
 pub(super) struct FormFields(HashMap<String, String>);
 

@@ -18,7 +18,6 @@ use crate::error::{CloudError, CloudResult};
 const SIZE: usize = 25;
 const FILES_MAX: usize = 500;
 
-/// The part of the list, as the address has it.
 #[derive(Debug, Deserialize)]
 pub(super) struct LambdaPart {
     #[serde(default)]

@@ -31,7 +31,6 @@ const PLACES: [(&str, &str, Role); 6] = [
 
 pub(super) type PageResult = Result<Response, PageError>;
 
-/// An error that is answered as a page.
 #[derive(Debug)]
 pub(super) struct PageError(pub(super) CloudError);
 
@@ -79,7 +78,6 @@ pub(super) async fn as_page(request: Request, next: Next) -> Response {
     page
 }
 
-/// Answers a path that does not exist.
 pub(crate) fn nothing_here() -> Response {
     let error = CloudError::missing("there is no page at this address", "use the links of a page");
     secured(PageError(error).into_response())
@@ -222,7 +220,6 @@ pub(super) fn parts(
     }
 }
 
-/// Returns a page with a status other than 200.
 pub(super) fn with_status(status: StatusCode, page: Response) -> Response {
     (status, page).into_response()
 }

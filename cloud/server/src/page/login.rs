@@ -5,13 +5,13 @@ use std::sync::Arc;
 use axum::extract::{Extension, State};
 use axum::http::{HeaderMap, header};
 use axum::response::{IntoResponse, Redirect, Response};
+use gleaner_fleet::entrance::ClientNetwork;
 use maud::{Markup, html};
 
 use super::guard::FormFields;
 use super::layout::{self, PageResult, failure, with_status};
 use super::password;
 use super::session::{Call, PageUser, Visit, session_of, set_cookie};
-use crate::clients::ClientNetwork;
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 

@@ -48,7 +48,6 @@ use crate::request::in_time;
 
 pub(crate) use layout::nothing_here;
 
-/// A page, or a form that it sends.
 pub(crate) struct PageRoute {
     /// Its method, which the handler has, too.
     #[cfg_attr(not(test), expect(dead_code, reason = "read by the test of all roles"))]

@@ -1,28 +1,23 @@
 //! Passwords: hashed with Argon2id, a few at a time.
 
-use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::LazyLock;
 use std::time::Duration;
 
 use argon2::password_hash::phc::PasswordHash;
 use argon2::password_hash::{PasswordHasher, PasswordVerifier};
 use argon2::{Algorithm, Argon2, Params, Version};
-use tokio::sync::Semaphore;
+use gleaner_fleet::entrance::{ClientNetwork, FairTurns};
 use tokio::time::timeout;
 
-use crate::clients::ClientNetwork;
 use crate::error::{CloudError, CloudResult};
 
-/// Number of hashes at a time: each takes 19 MiB and a core.
-static SLOTS: Semaphore = Semaphore::const_new(2);
-/// Time to wait for one of them.
-const WAIT: Duration = Duration::from_secs(10);
-
-/// The turn of each network whose passwords are checked. It has one at a time, so that a network
-/// with many connections delays others by one hash, not by all of its own.
-static TURNS: Mutex<BTreeMap<ClientNetwork, Arc<Semaphore>>> = Mutex::new(BTreeMap::new());
-/// Maximum number of passwords of a network that wait or are checked.
+/// Hashes at a time, each of 19 MiB and a core: a network with many connections delays others by
+/// one hash, not by all of its own.
+static TURNS: LazyLock<FairTurns> = LazyLock::new(|| FairTurns::new(2, WAITING_MAX));
+/// Maximum number of passwords of a network that wait.
 const WAITING_MAX: usize = 50;
+/// Time to wait for a turn.
+const WAIT: Duration = Duration::from_secs(10);
 
 /// Lengths of passwords, in bytes.
 const LENGTHS: std::ops::RangeInclusive<usize> = 12..=256;
@@ -40,8 +35,9 @@ pub(super) async fn hashed(password: String) -> CloudResult<String> {
         let message = format!("a password has {} to {} bytes", LENGTHS.start(), LENGTHS.end());
         return Err(CloudError::usage(message, "choose another one, such as four random words"));
     }
-    let hash = work(move || argon2()?.hash_password(password.as_bytes()).map(|it| it.to_string()));
-    hash.await?.map_err(|error| {
+    // Users who are logged in wait for one password of each network at most.
+    let hash = move || argon2()?.hash_password(password.as_bytes()).map(|it| it.to_string());
+    work(ClientNetwork::LOCAL, hash).await?.map_err(|error| {
         CloudError::busy("the password cannot be hashed", "try again").because(error)
     })
 }
@@ -57,12 +53,7 @@ pub(super) async fn is_right(
         return Ok(false);
     }
     let stored = hash.unwrap_or(NO_PASSWORD).to_owned();
-    let turn = turn_of(network)?;
-    let turn = timeout(WAIT, turn.acquire_owned()).await.map_err(|_| busy())?;
-    let turn = turn.map_err(|_| busy())?;
-    let is_equal = work(move || {
-        // As for the slot: it ends with the work.
-        let _turn = turn;
+    let is_equal = work(network, move || {
         let hash = PasswordHash::new(&stored).ok()?;
         argon2().ok()?.verify_password(password.as_bytes(), &hash).ok()
     });
@@ -76,25 +67,18 @@ fn argon2() -> argon2::password_hash::Result<Argon2<'static>> {
     Ok(Argon2::new(Algorithm::Argon2id, Version::V0x13, params))
 }
 
-fn turn_of(network: ClientNetwork) -> CloudResult<Arc<Semaphore>> {
-    let mut turns = TURNS.lock().unwrap_or_else(PoisonError::into_inner);
-    turns.retain(|_, turn| Arc::strong_count(turn) > 1);
-    let turn = turns.entry(network).or_insert_with(|| Arc::new(Semaphore::new(1)));
-    match Arc::strong_count(turn) > WAITING_MAX {
-        true => Err(busy()),
-        false => Ok(Arc::clone(turn)),
-    }
-}
-
 fn busy() -> CloudError {
     CloudError::busy("too many passwords are being checked", "try again in a minute")
 }
 
-async fn work<T: Send + 'static>(hash: impl FnOnce() -> T + Send + 'static) -> CloudResult<T> {
-    let slot = timeout(WAIT, SLOTS.acquire()).await.map_err(|_| busy())?.map_err(|_| busy())?;
-    // The slot is given back when the work ends, not when the browser leaves.
+async fn work<T: Send + 'static>(
+    network: ClientNetwork,
+    hash: impl FnOnce() -> T + Send + 'static,
+) -> CloudResult<T> {
+    let turn = timeout(WAIT, TURNS.take(network)).await.ok().flatten().ok_or_else(busy)?;
+    // The turn is given back when the work ends, not when the browser leaves.
     let done = tokio::task::spawn_blocking(move || {
-        let _slot = slot;
+        let _turn = turn;
         hash()
     });
     done.await.map_err(|_| busy())

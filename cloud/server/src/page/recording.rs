@@ -22,7 +22,6 @@ pub(super) const TOPICS_MAX: usize = 200;
 const FOOTER: usize = 29;
 const MAGIC: &[u8] = b"\x89MCAP0\r\n";
 
-/// The recording in a stored clip.
 #[derive(Debug, Default, PartialEq)]
 pub(super) struct Recording {
     pub(super) messages: u64,

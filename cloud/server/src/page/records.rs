@@ -2,6 +2,7 @@
 //! stream.
 
 use axum::extract::{Path, Query};
+use gleaner_protocol::vehicle_api::{LinePlace, in_order};
 use maud::{Markup, html};
 use serde::Deserialize;
 
@@ -14,7 +15,6 @@ use super::text::{query, segment, shown, vehicle_path};
 use super::vehicle::find;
 use crate::cloud::Cloud;
 use crate::error::CloudResult;
-use crate::records::{in_time_order, time_ns};
 use crate::request::PageLimit;
 use crate::store::{ClipQuery, NewestRecords};
 
@@ -25,7 +25,6 @@ const READ: usize = 1000;
 /// Maximum number of clips above a time line.
 const CLIPS: PageLimit = PageLimit::of(12);
 
-/// The records that a path names.
 #[derive(Debug, Clone, Deserialize)]
 pub(super) struct RecordSource {
     #[serde(rename = "name")]
@@ -35,7 +34,6 @@ pub(super) struct RecordSource {
     pub(super) lambda: Option<String>,
 }
 
-/// The part of the records, as the address has it.
 #[derive(Debug, Deserialize)]
 pub(super) struct RecordPart {
     before: Option<i64>,
@@ -77,7 +75,7 @@ impl RecordSource {
         &self,
         newest_first: impl DoubleEndedIterator<Item = L>,
     ) -> Markup {
-        let lines = in_time_order(newest_first.rev());
+        let lines = in_order(newest_first.rev(), |line| LinePlace::of_json(line.as_ref()));
         html! { @for text in lines.iter().rev() { (line(text.as_ref(), self.lambda.is_none())) } }
     }
 
@@ -173,12 +171,13 @@ async fn clips_of(
     has_end: bool,
     newest: &NewestRecords,
 ) -> CloudResult<Markup> {
-    let times = || newest.texts().filter_map(time_ns);
+    let times = newest.texts().map(|line| LinePlace::of_json(line).time_ns);
+    let times: Vec<_> = times.filter(|time| *time != 0).collect();
     let query = ClipQuery {
         vehicle: Some(vehicle.to_owned()),
         // Without older records, all clips from before are of this part.
-        from_ns: times().min().filter(|_| newest.has_more),
-        to_ns: times().max().filter(|_| has_end),
+        from_ns: times.iter().copied().min().filter(|_| newest.has_more),
+        to_ns: times.iter().copied().max().filter(|_| has_end),
         limit: CLIPS,
         ..ClipQuery::default()
     };

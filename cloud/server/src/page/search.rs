@@ -14,7 +14,6 @@ use crate::request::PageLimit;
 /// Maximum number of records on a page.
 const SIZE: PageLimit = PageLimit::of(100);
 
-/// A search, as the address has it.
 #[derive(Debug, Default, Deserialize)]
 pub(super) struct SearchPart {
     #[serde(default)]

@@ -15,10 +15,8 @@ const COOKIE: &str = "gleaner_session";
 /// Lifetime of the cookie, in s: that of the session in the database.
 const LIFETIME_S: u32 = 12 * 3600;
 
-/// A request of a session.
 pub(super) type Visit = Call<PageUser>;
 
-/// The user of a request, with the session.
 #[derive(Debug, Clone)]
 pub(super) struct PageUser {
     pub(super) user: User,
@@ -38,7 +36,6 @@ impl PageUser {
         matches!(cloud.store.session(&self.session).await, Ok(Some(user)) if user == self.user)
     }
 
-    /// Returns the user as one of the API, with a login.
     pub(super) fn token_user(&self) -> TokenUser {
         TokenUser::new(self.user.clone(), String::new())
     }

@@ -260,6 +260,11 @@ fn vehicle(status: &VehicleStatus) -> Markup {
                         .saturating_add(status.supervisor.as_ref().map_or(0, |it| it.events_lost));
                     @if lost == 0 { "no event was lost" }
                     @else { span.warn { (count(lost, "event")) " lost" } }
+                    @for lost in status.records_lost.iter().take(LAMBDAS_MAX) {
+                        br; span.warn {
+                            (count(lost.records, "record")) " of " (shown(&lost.stream)) " lost"
+                        }
+                    }
                 }
                 @match &status.supervisor {
                     None => { dt { "Supervisor" } dd { span.bad { "cannot be reached" } } },
@@ -276,7 +281,17 @@ fn connection(cloud: &CloudStatus) -> Markup {
         dd { (shown(&cloud.state)) " for " (span(cloud.since_s))
             @if let Some(reason) = &cloud.reason { ": " (shown(reason)) } }
         dt { "Not acknowledged" }
-        dd { (count(cloud.unsent, "record")) }
+        dd { (count(cloud.unsent, "record"))
+            @if cloud.uncounted > 0 {
+                ", and those of " (count(cloud.uncounted, "stream")) " not counted"
+            }
+            @for it in cloud.failing.iter().take(LAMBDAS_MAX) {
+                br; span.warn {
+                    (count(it.streams, "stream")) " not sent for " (span(it.since_s)) ", tried "
+                    (span(it.tried_s)) " ago: " (shown(&it.example))
+                }
+            }
+        }
     }
 }
 

@@ -35,7 +35,6 @@ pub(super) struct StreamStart {
     after: Option<i64>,
 }
 
-/// Follows the records of a page for one browser.
 struct RecordFollower {
     cloud: Arc<Cloud>,
     user: PageUser,

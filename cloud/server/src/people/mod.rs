@@ -28,6 +28,7 @@ use axum::response::{IntoResponse, Response};
 use axum::routing::{self, delete, get, post};
 use gleaner_fleet::Enrolment;
 use gleaner_fleet::clips::{ClipPolicy, ClipUsage, FleetClip};
+use gleaner_fleet::entrance::ClientNetwork;
 use gleaner_fleet::people::{
     AuditEntry, FleetDeployRequest, FleetDeployment, Invitation, ListPage, Login, NewToken,
     NewUser, NewVehicle, ReportedRelease, Role, TokenSummary, User, UserToken, VehicleSummary,
@@ -37,7 +38,6 @@ use gleaner_fleet::waves::WaveState;
 use gleaner_protocol::vehicle_api::{DeployReply, DeploymentEnvelopes, StreamLine, VehicleStatus};
 use serde_json::{Map, Value};
 
-use crate::clients::ClientNetwork;
 use crate::clips::people as clips;
 use crate::cloud::{Call, Cloud};
 use crate::error::{CloudError, CloudResult, as_problem, is_api};

@@ -10,6 +10,7 @@ use axum::extract::{Path, Query};
 use axum::http::{HeaderMap, header};
 use axum::response::{IntoResponse, Response};
 use futures_util::stream::try_unfold;
+use gleaner_protocol::vehicle_api::{LinePlace, in_order};
 use schemars::JsonSchema;
 use serde::Deserialize;
 use tokio::sync::watch;
@@ -18,7 +19,6 @@ use tokio::time::sleep;
 use crate::cloud::{Call, Cloud};
 use crate::error::{CloudError, CloudResult};
 use crate::readers::{ReaderSlot, ReaderToken};
-use crate::records::in_time_order;
 use crate::store::TokenUser;
 use crate::tails::TailReader;
 
@@ -28,7 +28,6 @@ const PIECE: i64 = 256;
 /// Time without a record after which a sign of life is sent among events.
 const QUIET: Duration = Duration::from_secs(10);
 
-/// The kind of a stream of events.
 const EVENTS: &str = "text/event-stream";
 
 /// Choice of the records of a stream, as on a vehicle.
@@ -165,7 +164,7 @@ impl RecordReader {
             lines.extend(page.lines);
             // Only the last line of a piece has a position: the others may be in any order.
             if self.streams[0] != self.streams[1] {
-                lines = in_time_order(lines);
+                lines = in_order(lines, |line| LinePlace::of_json(line));
             }
             if !lines.is_empty() {
                 return Ok(Some((self.text(&lines), self)));

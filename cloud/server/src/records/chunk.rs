@@ -20,7 +20,6 @@ const LINE_MORE: u64 = 72;
 /// MiB or a single longer one.
 const TEXT_MAX: u64 = 16 << 20;
 
-/// The first line of a chunk.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
 struct PackedHead {
     gleaner_chunk: u32,

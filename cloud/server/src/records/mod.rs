@@ -3,8 +3,8 @@
 //!
 //! `chunk` has the format of a chunk, and `files` its file. `packing` moves old records into chunks
 //! and removes what is too old; all replicas do so. `reading` returns records in the order of their
-//! arrival, `newest` from the newest on, and `search` those that match; `times` orders those
-//! that are shown together. Readers in other rooms see one sequence, and no chunk.
+//! arrival, `newest` from the newest on, and `search` those that match. Readers in other
+//! rooms see one sequence, and no chunk.
 
 mod chunk;
 mod files;
@@ -14,9 +14,7 @@ mod reading;
 mod search;
 #[cfg(test)]
 mod tests;
-mod times;
 
 pub(crate) use files::ChunkFiles;
 pub(crate) use packing::keep;
 pub(crate) use search::{RecordLevel, RecordSearch};
-pub(crate) use times::{in_time_order, time_ns};

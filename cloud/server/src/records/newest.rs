@@ -37,7 +37,6 @@ pub(crate) struct NewestFirst<'c> {
     most: usize,
     /// The records so far, the newest first: at most `most`.
     pub(crate) found: Vec<FoundLine>,
-    /// Number of bytes that were read.
     pub(crate) read_bytes: u64,
     /// Longest line whose text is read from a row.
     pub(super) longest: i64,

@@ -57,7 +57,6 @@ impl Cloud {
         }
     }
 
-    /// Returns the next chunk of a stream with its lines.
     async fn next_chunk(
         &self,
         of: (&str, &str),

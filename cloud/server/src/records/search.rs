@@ -52,7 +52,6 @@ pub(crate) enum RecordLevel {
 }
 
 impl RecordLevel {
-    /// Parses the name of a level.
     pub(crate) fn parse(name: &str) -> Option<Self> {
         let name = serde::de::value::StrDeserializer::<serde::de::value::Error>::new(name);
         Self::deserialize(name).ok()
@@ -86,7 +85,6 @@ pub(crate) struct RecordSearch {
     pub(crate) limit: PageLimit,
 }
 
-/// The place from which a search goes on.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 struct SearchPosition {
     /// The vehicle; empty for the first one.
@@ -97,7 +95,6 @@ struct SearchPosition {
     before: Option<i64>,
 }
 
-/// Facts of a record that a search compares.
 #[derive(Debug, Default)]
 pub(super) struct LineFacts {
     pub(super) time_ns: i64,
@@ -169,7 +166,6 @@ impl<'s> RecordFilter<'s> {
             || to_ns.is_some_and(|to| chunk.first_time > to)
     }
 
-    /// Returns whether a record matches.
     fn has(&self, text: &str) -> bool {
         if !text.to_ascii_lowercase().contains(&self.written) {
             return false;
@@ -209,7 +205,6 @@ fn is_of_kind(line: &StreamLine, kind: &str) -> bool {
     }
 }
 
-/// The work of a request.
 struct SearchWork {
     limit: usize,
     items: Vec<FoundRecord>,

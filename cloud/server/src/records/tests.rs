@@ -17,7 +17,6 @@ const SIZES: ChunkSizes = ChunkSizes { chunk: 2000, rows: 1000 };
 const STREAMS: [&str; 2] = ["events", "orchestrator"];
 const BRAKE: &str = "lambdas/brake";
 
-/// A cloud with a vehicle that is connected.
 struct Recorded {
     folder: TempDir,
     cloud: Arc<Cloud>,

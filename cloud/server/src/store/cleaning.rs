@@ -9,7 +9,6 @@ use std::collections::BTreeSet;
 use gleaner_fleet::clips::{ClipId, ClipState, ClipUsage};
 use gleaner_trust::unverified_revision;
 
-use super::clips::clip_id;
 use super::{CloudStore, StoreChange, int, unsigned};
 use crate::error::{CloudError, CloudResult};
 use crate::sqlx;
@@ -19,7 +18,7 @@ const RULES: &str = "rules";
 /// Number of clips that are removed in one transaction: others wait for it.
 const CLIPS_AT_ONCE: i64 = 100;
 
-/// Number of a clip, its name, its vehicle, and the bytes of its file.
+/// A clip that is stored: its number, name, vehicle and bytes.
 type StoredRow = (i64, String, String, i64);
 
 /// Files of clips whose rows were removed.
@@ -41,14 +40,15 @@ impl CloudStore {
                 .because(format!("its state is `{}`", clip.state.as_str())));
         }
         let mut change = self.change().await?;
-        let row: Option<StoredRow> = row!(&mut *change.tx;
-            "SELECT seq, name, vehicle, bytes FROM clips
+        let row: Option<(i64, i64)> = row!(&mut *change.tx;
+            "SELECT seq, bytes FROM clips
              WHERE vehicle = $1 AND name = $2 AND state = 'stored'";
             id.vehicle(), id.name());
-        let row = row.ok_or_else(|| {
+        let (seq, bytes) = row.ok_or_else(|| {
             CloudError::missing(format!("clip `{id}` was removed"), "`gleaner clips` lists all")
         })?;
-        change.remove_clips(&[row]).await?;
+        let (name, vehicle) = (id.name().to_owned(), id.vehicle().to_owned());
+        change.remove_clips(&[(seq, name, vehicle, bytes)]).await?;
         change.note(actor, "remove clip", &id.to_string()).await?;
         change.commit().await
     }
@@ -64,19 +64,21 @@ impl CloudStore {
         let mut change = self.change().await?;
         // Counted in the change: others may have removed some until it began.
         let (kept,): (i64,) = one!(&mut *change.tx;
-            "SELECT CAST(COALESCE(SUM(bytes), 0) AS BIGINT) FROM clips WHERE state = 'stored'");
+            "SELECT CAST(COALESCE(SUM(disk + bytes), 0) AS BIGINT) FROM clips
+             WHERE state = 'stored'");
         let mut kept = unsigned(kept);
-        let oldest: Vec<(i64, String, String, i64, i64)> = rows!(&mut *change.tx;
-            "SELECT seq, name, vehicle, bytes, part_time FROM clips WHERE state = 'stored'
-             ORDER BY part_time, seq LIMIT $1";
+        let oldest: Vec<(i64, String, String, i64, i64, i64)> = rows!(&mut *change.tx;
+            "SELECT seq, name, vehicle, bytes, disk, part_time FROM clips
+             WHERE state = 'stored' ORDER BY part_time, seq LIMIT $1";
             CLIPS_AT_ONCE);
         let mut expired: Vec<StoredRow> = Vec::new();
-        for (seq, name, vehicle, bytes, stored) in oldest {
-            let is_old = policy.keep_s > 0 && stored <= before;
-            if !is_old && (policy.keep_bytes == 0 || kept <= policy.keep_bytes) {
+        for (seq, name, vehicle, bytes, disk, time) in oldest {
+            let is_old = policy.keep_s > 0 && time <= before;
+            let has_excess = policy.keep_bytes > 0 && kept > policy.keep_bytes;
+            if !is_old && !has_excess {
                 break;
             }
-            kept = kept.saturating_sub(unsigned(bytes));
+            kept = kept.saturating_sub(unsigned(disk + bytes));
             expired.push((seq, name, vehicle, bytes));
         }
         if expired.is_empty() {
@@ -92,13 +94,15 @@ impl CloudStore {
 
     /// Returns what is stored of clips, and what was removed.
     pub(crate) async fn clip_counts(&self) -> CloudResult<ClipUsage> {
-        let (stored, bytes, removed, removed_bytes): (i64, i64, i64, i64) = one!(&self.pool;
+        let (stored, bytes, removed, removed_bytes, disk): (i64, i64, i64, i64, i64) = one!(
+            &self.pool;
             "SELECT (SELECT COUNT(*) FROM clips WHERE state = 'stored'),
              (SELECT CAST(COALESCE(SUM(bytes), 0) AS BIGINT) FROM clips WHERE state = 'stored'),
-             removed, removed_bytes FROM clip_policy");
-        let [stored, bytes, removed, removed_bytes] =
-            [stored, bytes, removed, removed_bytes].map(unsigned);
-        Ok(ClipUsage { stored, bytes, removed, removed_bytes })
+             removed, removed_bytes,
+             (SELECT CAST(COALESCE(SUM(disk), 0) AS BIGINT) FROM clip_vehicles) FROM clip_policy");
+        let [stored, bytes, removed, removed_bytes, disk_bytes] =
+            [stored, bytes, removed, removed_bytes, disk].map(unsigned);
+        Ok(ClipUsage { stored, bytes, removed, removed_bytes, disk_bytes })
     }
 
     /// Returns clips that were removed, and whose files may still be there.
@@ -123,6 +127,7 @@ impl CloudStore {
         let mut change = self.change().await?;
         run!(&mut *change.tx; "DELETE FROM removed_clips WHERE vehicle = $1 AND name = $2";
             id.vehicle(), id.name());
+        change.count_clip_bytes(id.vehicle()).await?;
         change.commit().await
     }
 
@@ -168,17 +173,22 @@ impl CloudStore {
 impl StoreChange<'_> {
     async fn remove_clips(&mut self, rows: &[StoredRow]) -> CloudResult<()> {
         for (seq, name, vehicle, _) in rows {
+            self.note_removed(vehicle, name, true).await?;
             run!(&mut *self.tx; "DELETE FROM clip_words WHERE clip = $1"; seq);
             run!(&mut *self.tx; "DELETE FROM clips WHERE seq = $1"; seq);
-            run!(&mut *self.tx;
-                "INSERT INTO removed_clips (vehicle, name) VALUES ($1, $2)
-                 ON CONFLICT (vehicle, name) DO NOTHING";
-                vehicle, name);
         }
-        let bytes: i64 = rows.iter().map(|row| row.3).sum();
+        let vehicles: BTreeSet<_> = rows.iter().map(|(_, _, vehicle, _)| vehicle).collect();
+        for vehicle in vehicles {
+            self.count_clip_bytes(vehicle).await?;
+        }
+        let (removed, bytes) = (rows.len() as i64, rows.iter().map(|row| row.3).sum::<i64>());
         run!(&mut *self.tx;
             "UPDATE clip_policy SET removed = removed + $1, removed_bytes = removed_bytes + $2";
-            rows.len() as i64, bytes);
+            removed, bytes);
         Ok(())
     }
+}
+
+fn clip_id((name, vehicle): (String, String)) -> Option<ClipId> {
+    ClipId::new(name.parse().ok()?, &vehicle).ok()
 }

@@ -39,7 +39,7 @@ macro_rules! select {
     ($rest:literal) => {
         concat!(
             "SELECT seq, vehicle, name, facts, bytes, has_thumbnail, is_requested, state, reason, \
-             parts FROM clips ",
+             received FROM clips ",
             $rest
         )
     };
@@ -112,12 +112,15 @@ impl CloudStore {
         // It may have been stored since: that is not undone.
         let is_lost = i64::from(is_lost);
         let changed = run!(&mut *change.tx;
-            "UPDATE clips SET is_requested = 1, failures = 0, state = 'vehicle',
-             parts = CASE WHEN state = 'vehicle' THEN parts ELSE 0 END
+            "UPDATE clips SET is_requested = 1, failures = 0,
+             state = CASE WHEN sha256 = '' THEN state ELSE 'vehicle' END,
+             parts = CASE WHEN state = 'stored' THEN 0 ELSE parts END,
+             received = CASE WHEN state = 'stored' THEN 0 ELSE received END
              WHERE vehicle = $1 AND name = $2 AND (is_requested = 0 OR state <> 'vehicle')
              AND state <> 'gone' AND (state <> 'stored' OR $3 = 1)";
             id.vehicle(), id.name(), is_lost);
         if changed.rows_affected() > 0 {
+            change.count_clip_bytes(id.vehicle()).await?;
             change.note(actor, "pull clip", &id.to_string()).await?;
             // The vehicle reads its orders again with each new number.
             run!(&mut *change.tx;
@@ -129,7 +132,8 @@ impl CloudStore {
 }
 
 fn clip(row: ClipRow, upload: UploadedClips) -> CloudResult<FleetClip> {
-    let (_, vehicle, name, facts, bytes, has_thumbnail, is_requested, state, reason, parts) = row;
+    let (_, vehicle, name, facts, bytes, has_thumbnail, is_requested, state, reason, received) =
+        row;
     let damaged = |error: String| {
         CloudError::usage(format!("the clip `{name}` of `{vehicle}` is damaged"), "report this")
             .because(error)
@@ -137,13 +141,13 @@ fn clip(row: ClipRow, upload: UploadedClips) -> CloudResult<FleetClip> {
     let facts: ClipFacts =
         serde_json::from_str(&facts).map_err(|error| damaged(error.to_string()))?;
     let id = ClipId::new(facts.name.clone(), &vehicle).map_err(damaged)?;
-    let (bytes, received) = (unsigned(bytes), unsigned(parts) * gleaner_fleet::clips::CLIP_PART);
+    let (bytes, received) = (unsigned(bytes), unsigned(received));
     let state = match &*state {
         "stored" => ClipState::Stored,
         "gone" => ClipState::Gone,
         "failed" => ClipState::Failed,
         _ if !upload.wants(is_requested != 0) => ClipState::OnVehicle,
-        _ if parts > 0 => ClipState::Uploading,
+        _ if received > 0 => ClipState::Uploading,
         _ => ClipState::Wanted,
     };
     Ok(FleetClip {

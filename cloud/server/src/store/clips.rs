@@ -4,13 +4,15 @@ use std::collections::BTreeSet;
 
 use gleaner_base::{excerpt, visible};
 use gleaner_fleet::clips::{
-    ClipFacts, ClipId, ClipName, ClipOrders, ClipPolicy, ClipReport, GoneClip, WantedClip,
+    CLIP_PART, ClipFacts, ClipId, ClipName, ClipOrders, ClipPolicy, ClipReport, GoneClip,
+    THUMBNAIL_MAX, WantedClip,
 };
 
+use super::clip_quotas::{CLIP_MIN, ClipBounds};
 use super::numbers::check_number;
 use super::vehicles::ended;
 use super::wants::next_wanted;
-use super::{CloudStore, DAY_S, StoreChange, int, now, unsigned};
+use super::{CloudStore, StoreChange, int, unsigned};
 use crate::error::{CloudError, CloudResult};
 
 /// Number of clips of a vehicle that are wanted, and of thumbnails, in its orders.
@@ -18,80 +20,40 @@ const ORDERS_MAX: i64 = 64;
 /// Number of uploads of another file than announced, after which a clip is not wanted any more.
 const FAILURES_MAX: i64 = 3;
 
-/// Bounds of what is kept of clips.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct ClipBounds {
-    /// Clips of a vehicle, with files or without.
-    pub(crate) clips: u64,
-    /// Bytes of the files of a vehicle.
-    pub(crate) vehicle_bytes: u64,
-    /// Bytes of all files.
-    pub(crate) bytes: u64,
-    /// Unfinished files of a vehicle.
-    pub(crate) unfinished: u64,
-    /// Time after which an unfinished file is removed, in s.
-    pub(crate) unfinished_s: u64,
-}
-
-impl ClipBounds {
-    pub(crate) const DEFAULT: ClipBounds = ClipBounds {
-        clips: 20_000,
-        vehicle_bytes: 64 << 30,
-        bytes: 1 << 40,
-        unfinished: 4,
-        unfinished_s: 7 * 86_400,
-    };
-}
-
 /// The file of a clip, as it was announced and as far as it was received.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct ClipProgress {
     pub(crate) id: ClipId,
     pub(crate) bytes: u64,
     pub(crate) sha256: String,
-    /// Number of the next part.
+    /// Number of the next part, and of the bytes before it.
     pub(crate) part: u64,
+    pub(crate) received: u64,
 }
 
-/// Bytes of files.
-struct UsedBytes {
-    /// Those of a vehicle.
-    own: u64,
-    /// Those of all vehicles.
-    all: u64,
-}
-
-impl UsedBytes {
-    /// Returns the reason why a further file of this length does not fit.
-    fn excess(&self, bytes: u64, bounds: ClipBounds) -> Option<String> {
-        let limits = [
-            (self.own, bounds.vehicle_bytes, "of its vehicle"),
-            (self.all, bounds.bytes, "of all vehicles"),
-        ];
-        let full = limits.into_iter().find(|(used, most, _)| used.saturating_add(bytes) > *most);
-        full.map(|(used, most, of)| format!("clips {of} have {used} of {most} bytes already"))
-    }
+/// A part of a file that was acknowledged.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct StoredPart {
+    pub(crate) sha256: String,
+    pub(crate) bytes: u64,
 }
 
 impl CloudStore {
-    /// Stores what a vehicle reports; returns the clips whose files the cloud must remove. A clip
-    /// that was announced before stays as it is.
+    /// Stores what a vehicle reports. A clip that was announced before stays as it is. Files that
+    /// do not count any more are noted, and removed with the next look.
     pub(crate) async fn announce_clips(
         &self,
         vehicle: &str,
         report: &ClipReport,
         bounds: ClipBounds,
-    ) -> CloudResult<Vec<ClipId>> {
-        let mut dropped = Vec::new();
+    ) -> CloudResult<()> {
         let mut change = self.change().await?;
         change.must_count(vehicle).await?;
         for facts in &report.clips {
             change.add_clip(vehicle, facts).await?;
         }
-        for gone in &report.gone {
-            if change.lose_clip(vehicle, gone).await? {
-                dropped.extend(ClipId::new(gone.name.clone(), vehicle));
-            }
+        for GoneClip { name, is_thumbnail, reason } in &report.gone {
+            change.lose_clip(vehicle, name, reason, *is_thumbnail).await?;
         }
         if let Some(position) = &report.cursor {
             run!(&mut *change.tx;
@@ -99,9 +61,9 @@ impl CloudStore {
                  ON CONFLICT (vehicle) DO UPDATE SET position = excluded.position";
                 vehicle, position);
         }
-        dropped.extend(change.forget_clips(vehicle, bounds).await?);
-        change.commit().await?;
-        Ok(dropped)
+        change.forget_clips(vehicle, bounds).await?;
+        change.count_clip_bytes(vehicle).await?;
+        change.commit().await
     }
 
     /// Returns everything that is wanted of the clips of a vehicle.
@@ -110,24 +72,28 @@ impl CloudStore {
         vehicle: &str,
         bounds: ClipBounds,
     ) -> CloudResult<ClipOrders> {
-        let row: Option<(String, i64, i64)> = row!(&self.pool;
-            "SELECT position, day, day_bytes FROM clip_vehicles WHERE vehicle = $1"; vehicle);
-        let (position, day, sent) = row.unwrap_or_default();
-        let thumbnails: Vec<(String,)> = rows!(&self.pool;
-            "SELECT name FROM clips WHERE vehicle = $1 AND thumbnail <> '' AND has_thumbnail = 0
-             ORDER BY seq LIMIT $2";
-            vehicle, ORDERS_MAX);
+        let row: Option<(String,)> = row!(&self.pool;
+            "SELECT position FROM clip_vehicles WHERE vehicle = $1"; vehicle);
+        let position = row.unwrap_or_default().0;
         let policy = self.clip_policy().await?;
-        let is_used_up = day == today() && unsigned(sent) >= policy.day_bytes;
-        let wanted = match is_used_up {
-            true => Vec::new(),
-            false => self.wanted_clips(vehicle, &policy, bounds).await?,
-        };
-        Ok(ClipOrders {
+        let budget = self.clip_budget(vehicle, &policy).await?;
+        let mut orders = ClipOrders {
             cursor: (!position.is_empty()).then_some(position),
-            thumbnails: thumbnails.into_iter().filter_map(|(it,)| it.parse().ok()).collect(),
-            wanted,
-        })
+            budget: Some(budget),
+            ..ClipOrders::default()
+        };
+        if !budget.is_spent {
+            let rows: Vec<(String,)> = rows!(&self.pool;
+                "SELECT name FROM clips WHERE vehicle = $1 AND thumbnail <> ''
+                 AND has_thumbnail = 0 ORDER BY seq LIMIT $2";
+                vehicle, ORDERS_MAX);
+            if !rows.is_empty() && self.clip_usage(vehicle).await?.fits(THUMBNAIL_MAX, bounds) {
+                let names = rows.into_iter().filter_map(|(name,)| name.parse().ok());
+                orders.thumbnails = names.collect();
+            }
+            orders.wanted = self.wanted_clips(vehicle, &policy, bounds).await?;
+        }
+        Ok(orders)
     }
 
     /// Returns the files that a vehicle should send, the most important first: what a person
@@ -141,7 +107,7 @@ impl CloudStore {
         let unfinished = self.unfinished_clips(vehicle).await?;
         let may_begin = i64::from(unfinished < bounds.unfinished);
         let rows: Vec<(String, i64, String, i64)> = rows!(&self.pool;
-            "SELECT name, bytes, sha256, parts FROM clips
+            "SELECT name, bytes, sha256, received FROM clips
              WHERE vehicle = $1 AND state = 'vehicle' AND sha256 <> '' AND bytes > 0
              AND $2 <> 'none' AND (is_requested = 1 OR $2 = 'all') AND (parts > 0 OR $3 = 1)
              ORDER BY is_requested DESC, score DESC, from_ns, seq LIMIT $4";
@@ -150,23 +116,13 @@ impl CloudStore {
             return Ok(Vec::new());
         }
         let usage = self.clip_usage(vehicle).await?;
-        let wanted = rows.into_iter().filter_map(|(name, bytes, sha256, parts)| {
-            let (name, bytes, part) = (name.parse().ok()?, unsigned(bytes), unsigned(parts));
-            Some(WantedClip { name, bytes, sha256, part })
+        let wanted = rows.into_iter().filter_map(|(name, bytes, sha256, received)| {
+            let (name, bytes, from) = (name.parse().ok()?, unsigned(bytes), unsigned(received));
+            Some(WantedClip { name, bytes, sha256, part: from / CLIP_PART, from: Some(from) })
         });
         // Files that do not fit must not keep smaller ones from being sent.
-        Ok(wanted.filter(|it| it.part > 0 || usage.excess(it.bytes, bounds).is_none()).collect())
-    }
-
-    /// Returns the bytes of the files of a vehicle, and of all, those that are announced of
-    /// unfinished ones.
-    async fn clip_usage(&self, vehicle: &str) -> CloudResult<UsedBytes> {
-        let (own, all): (i64, i64) = one!(&self.pool;
-            "SELECT (SELECT CAST(COALESCE(SUM(bytes), 0) AS BIGINT) FROM clips
-                     WHERE vehicle = $1 AND parts > 0),
-                    (SELECT CAST(COALESCE(SUM(bytes), 0) AS BIGINT) FROM clips WHERE parts > 0)";
-            vehicle);
-        Ok(UsedBytes { own: unsigned(own), all: unsigned(all) })
+        let fits = |it: &WantedClip| it.from > Some(0) || usage.fits(it.bytes, bounds);
+        Ok(wanted.filter(fits).collect())
     }
 
     /// Returns the number of files of a vehicle that have not come in full yet.
@@ -193,13 +149,14 @@ impl CloudStore {
             let message = format!("clip `{name}` is not wanted of this vehicle");
             CloudError::missing(message, "ask for the orders again: `POST /v1/clips`")
         };
-        let row: Option<(i64, String, i64, i64, String)> = row!(&self.pool;
-            "SELECT bytes, sha256, parts, is_requested, state FROM clips
+        let row: Option<(i64, String, i64, i64, i64, String)> = row!(&self.pool;
+            "SELECT bytes, sha256, parts, received, is_requested, state FROM clips
              WHERE vehicle = $1 AND name = $2 AND sha256 <> ''";
             vehicle, name.as_str());
-        let (bytes, sha256, parts, is_requested, state) = row.ok_or_else(not_wanted)?;
+        let (bytes, sha256, parts, received, is_requested, state) = row.ok_or_else(not_wanted)?;
         let id = ClipId::new(name.clone(), vehicle).map_err(|_| not_wanted())?;
-        let progress = ClipProgress { id, bytes: unsigned(bytes), sha256, part: unsigned(parts) };
+        let [bytes, part, received] = [bytes, parts, received].map(unsigned);
+        let progress = ClipProgress { id, bytes, sha256, part, received };
         if state == "stored" {
             return Ok(progress);
         }
@@ -207,74 +164,83 @@ impl CloudStore {
         if !policy.upload.wants(is_requested != 0) || state != "vehicle" {
             return Err(not_wanted());
         }
-        if progress.part == 0 {
+        let is_new = progress.part == 0;
+        if is_new {
             let unfinished = self.unfinished_clips(vehicle).await?;
-            let usage = self.clip_usage(vehicle).await?;
-            let mut full = usage.excess(progress.bytes, bounds);
             if unfinished >= bounds.unfinished {
-                full = Some(format!("{unfinished} uploads of the vehicle are unfinished"));
-            }
-            if let Some(reason) = full {
                 let message = format!("there is no room for clip `{name}`");
-                let help = "continue an unfinished upload, or wait until clips were removed";
-                return Err(CloudError::busy(message, help).because(reason));
+                let reason = format!("{unfinished} uploads of the vehicle are unfinished");
+                return Err(CloudError::busy(message, "continue one of them").because(reason));
             }
         }
+        let file = format!("clip `{name}`");
+        self.must_fit(vehicle, (&file, is_new.then_some(progress.bytes)), bounds).await?;
         Ok(progress)
     }
 
     /// Notes that a part is durable, unless it was noted already or the vehicle does not count any
     /// more. With the last one, the file is stored.
+    ///
+    /// # Errors
+    ///
+    /// Also one if the file does not fit any more, as others have begun meanwhile.
     pub(crate) async fn clip_part_received(
         &self,
         progress: &ClipProgress,
         (length, sha256): (u64, &str),
         is_last: bool,
+        bounds: ClipBounds,
     ) -> CloudResult<()> {
         let ClipProgress { id, part, .. } = progress;
         let mut change = self.change().await?;
         change.must_count(id.vehicle()).await?;
         let stored = run!(&mut *change.tx;
-            "UPDATE clips SET parts = parts + 1, part_time = $4, reason = '',
-             state = CASE WHEN $5 = 1 THEN 'stored' ELSE state END
+            "UPDATE clips SET parts = parts + 1, received = received + $6, part_time = $4,
+             reason = '', state = CASE WHEN $5 = 1 THEN 'stored' ELSE state END
              WHERE vehicle = $1 AND name = $2 AND parts = $3 AND state = 'vehicle'";
-            id.vehicle(), id.name(), int(*part), self.age_now(), i64::from(is_last));
+            id.vehicle(), id.name(), int(*part), self.age_now(), i64::from(is_last), int(length));
         if stored.rows_affected() > 0 {
             run!(&mut *change.tx;
-                "INSERT INTO clip_parts (clip, part, sha256)
-                 SELECT seq, $3, $4 FROM clips WHERE vehicle = $1 AND name = $2
-                 ON CONFLICT (clip, part) DO UPDATE SET sha256 = excluded.sha256";
-                id.vehicle(), id.name(), int(*part), sha256);
-            run!(&mut *change.tx;
-                "INSERT INTO clip_vehicles (vehicle, day, day_bytes) VALUES ($1, $2, $3)
-                 ON CONFLICT (vehicle) DO UPDATE SET day = excluded.day, day_bytes =
-                 CASE WHEN clip_vehicles.day = excluded.day THEN clip_vehicles.day_bytes ELSE 0 END
-                 + excluded.day_bytes";
-                id.vehicle(), today(), int(length));
+                "INSERT INTO clip_parts (clip, part, sha256, bytes)
+                 SELECT seq, $3, $4, $5 FROM clips WHERE vehicle = $1 AND name = $2
+                 ON CONFLICT (clip, part) DO UPDATE
+                 SET sha256 = excluded.sha256, bytes = excluded.bytes";
+                id.vehicle(), id.name(), int(*part), sha256, int(length));
+        }
+        if *part == 0 {
+            change.count_clip_bytes(id.vehicle()).await?;
+            change.must_have_room(id, bounds).await?;
         }
         change.commit().await
     }
 
-    /// Returns the SHA-256 of each part of a file that was acknowledged.
-    pub(crate) async fn clip_parts(&self, id: &ClipId) -> CloudResult<Vec<String>> {
-        let rows: Vec<(String,)> = rows!(&self.pool;
-            "SELECT clip_parts.sha256 FROM clip_parts JOIN clips ON clips.seq = clip_parts.clip
+    /// Returns the parts of a file that were acknowledged.
+    pub(crate) async fn clip_parts(&self, id: &ClipId) -> CloudResult<Vec<StoredPart>> {
+        let rows: Vec<(String, i64)> = rows!(&self.pool;
+            "SELECT clip_parts.sha256, clip_parts.bytes FROM clip_parts
+             JOIN clips ON clips.seq = clip_parts.clip
              WHERE vehicle = $1 AND name = $2 AND part < parts ORDER BY part";
             id.vehicle(), id.name());
-        Ok(rows.into_iter().map(|(sha256,)| sha256).collect())
+        let part = |(sha256, bytes)| StoredPart { sha256, bytes: unsigned(bytes) };
+        Ok(rows.into_iter().map(part).collect())
     }
 
     /// Forgets the parts of a file, which was not the announced one or is not there; returns
     /// whether it was not complete.
     pub(crate) async fn clip_upload_failed(&self, id: &ClipId, reason: &str) -> CloudResult<bool> {
         let mut change = self.change().await?;
+        change.note_removed(id.vehicle(), id.name(), false).await?;
         let failed = run!(&mut *change.tx;
-            "UPDATE clips SET parts = 0, failures = failures + 1, reason = $3,
+            "UPDATE clips SET parts = 0, received = 0, failures = failures + 1, reason = $3,
              state = CASE WHEN failures + 1 >= $4 THEN 'failed' ELSE 'vehicle' END
              WHERE vehicle = $1 AND name = $2 AND state = 'vehicle'";
             id.vehicle(), id.name(), excerpt(reason), FAILURES_MAX);
+        if failed.rows_affected() == 0 {
+            return Ok(false);
+        }
+        change.count_clip_bytes(id.vehicle()).await?;
         change.commit().await?;
-        Ok(failed.rows_affected() > 0)
+        Ok(true)
     }
 
     /// Returns the SHA-256 of the thumbnail that is wanted of a clip.
@@ -291,12 +257,14 @@ impl CloudStore {
     }
 
     /// Notes that the thumbnail of a clip is durable.
-    pub(crate) async fn thumbnail_received(&self, id: &ClipId) -> CloudResult<()> {
+    pub(crate) async fn thumbnail_received(&self, id: &ClipId, bytes: u64) -> CloudResult<()> {
         let mut change = self.change().await?;
         change.must_count(id.vehicle()).await?;
         run!(&mut *change.tx;
-            "UPDATE clips SET has_thumbnail = 1 WHERE vehicle = $1 AND name = $2";
-            id.vehicle(), id.name());
+            "UPDATE clips SET has_thumbnail = 1, disk = disk + $3
+             WHERE vehicle = $1 AND name = $2 AND has_thumbnail = 0";
+            id.vehicle(), id.name(), int(bytes));
+        change.count_clip_bytes(id.vehicle()).await?;
         change.commit().await
     }
 
@@ -310,16 +278,22 @@ impl CloudStore {
         change.commit().await
     }
 
-    /// Forgets the parts of files of which none came since `seconds`; returns these clips.
-    pub(crate) async fn forget_unfinished_clips(&self, seconds: u64) -> CloudResult<Vec<ClipId>> {
+    /// Forgets the parts of files of which none came since `seconds`.
+    pub(crate) async fn forget_unfinished_clips(&self, seconds: u64) -> CloudResult<()> {
         let before = self.age_now() - int(seconds);
         let mut change = self.change().await?;
         let rows: Vec<(String, String)> = rows!(&mut *change.tx;
-            "UPDATE clips SET parts = 0
-             WHERE state = 'vehicle' AND parts > 0 AND part_time <= $1 RETURNING name, vehicle";
+            "SELECT name, vehicle FROM clips
+             WHERE state IN ('vehicle', 'failed') AND parts > 0 AND part_time <= $1";
             before);
-        change.commit().await?;
-        Ok(rows.into_iter().filter_map(clip_id).collect())
+        for (name, vehicle) in &rows {
+            change.note_removed(vehicle, name, false).await?;
+            run!(&mut *change.tx;
+                "UPDATE clips SET parts = 0, received = 0 WHERE vehicle = $1 AND name = $2";
+                vehicle, name);
+            change.count_clip_bytes(vehicle).await?;
+        }
+        change.commit().await
     }
 
     pub(crate) async fn clip_policy(&self) -> CloudResult<ClipPolicy> {
@@ -365,6 +339,7 @@ impl StoreChange<'_> {
         row.map(drop).ok_or_else(ended)
     }
 
+    /// Stores what a clip is.
     async fn add_clip(&mut self, vehicle: &str, facts: &ClipFacts) -> CloudResult<()> {
         let (last,): (i64,) = one!(&mut *self.tx; "SELECT COALESCE(MAX(seq), 0) FROM clips");
         let (name, sha256) = (facts.name.as_str(), facts.sha256.as_deref().unwrap_or(""));
@@ -372,20 +347,24 @@ impl StoreChange<'_> {
         // A cast of a float stops at the bounds of the integer.
         let score = (scores.fold(0.0, f64::max) * 1e6) as i64;
         let text = serde_json::to_string(facts).unwrap_or_default();
+        let reason = facts.unreadable.as_ref().map_or_else(String::new, |cause| {
+            format!("the vehicle cannot read it: {}", visible(&excerpt(cause)))
+        });
+        let state = match (sha256.is_empty(), reason.is_empty()) {
+            (true, true) => "gone",
+            (true, false) => "failed",
+            (false, _) => "vehicle",
+        };
         let inserted = run!(&mut *self.tx;
             "INSERT INTO clips (seq, vehicle, name, facts, from_ns, to_ns, bytes, sha256, thumbnail,
-             score, state) VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11)
+             score, state, reason, disk)
+             VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13)
              ON CONFLICT (vehicle, name) DO NOTHING";
-            last + 1, vehicle, name, text, facts.from_ns, facts.to_ns, int(facts.bytes), sha256,
-            facts.thumbnail.as_deref().unwrap_or(""), score,
-            if sha256.is_empty() { "gone" } else { "vehicle" });
+            last + 1, vehicle, name, &text, facts.from_ns, facts.to_ns, int(facts.bytes), sha256,
+            facts.thumbnail.as_deref().unwrap_or(""), score, state, &reason,
+            int(CLIP_MIN + text.len() as u64));
         if inserted.rows_affected() == 0 {
-            let (before,): (String,) = one!(&mut *self.tx;
-                "SELECT sha256 FROM clips WHERE vehicle = $1 AND name = $2"; vehicle, name);
-            if before != sha256 && !sha256.is_empty() {
-                tracing::warn!(vehicle, clip = name, "a clip was announced again, as another file");
-            }
-            return Ok(());
+            return self.change_clip(vehicle, facts, (state, &reason), &text).await;
         }
         let lambdas = facts.lambdas.iter().map(|it| ("lambda", &it.name));
         let labels = facts.moments.iter().map(|it| ("label", &it.label));
@@ -400,53 +379,91 @@ impl StoreChange<'_> {
         Ok(())
     }
 
-    /// Notes that a file is not on its vehicle any more; returns whether parts of it are stored.
-    async fn lose_clip(&mut self, vehicle: &str, gone: &GoneClip) -> CloudResult<bool> {
-        let (name, reason) = (gone.name.as_str(), visible(&excerpt(&gone.reason)));
-        if gone.is_thumbnail {
+    /// Changes a clip that is announced again, if its vehicle has deleted it, cannot read it any
+    /// more, or can again.
+    async fn change_clip(
+        &mut self,
+        vehicle: &str,
+        facts: &ClipFacts,
+        (state, reason): (&str, &str),
+        text: &str,
+    ) -> CloudResult<()> {
+        let (name, sha256) = (facts.name.as_str(), facts.sha256.as_deref().unwrap_or(""));
+        if state == "gone" {
+            let reason = "the vehicle has deleted the file";
+            return self.lose_clip(vehicle, &facts.name, reason, false).await;
+        }
+        if state == "failed" {
+            run!(&mut *self.tx;
+                "UPDATE clips SET sha256 = '', state = 'failed', reason = $3
+                 WHERE vehicle = $1 AND name = $2 AND state IN ('vehicle', 'failed')";
+                vehicle, name, reason);
+            return Ok(());
+        }
+        let (sha256_before, bytes, text_before): (String, i64, String) = one!(&mut *self.tx;
+            "SELECT sha256, bytes, facts FROM clips WHERE vehicle = $1 AND name = $2";
+            vehicle, name);
+        if sha256_before.is_empty() && bytes != int(facts.bytes) {
+            self.note_removed(vehicle, name, false).await?;
+        }
+        // It goes on where it was: all of the file is compared at its end.
+        let is_read = run!(&mut *self.tx;
+            "UPDATE clips SET sha256 = $3, state = 'vehicle', reason = '', facts = $4, bytes = $5,
+             thumbnail = CASE WHEN has_thumbnail = 1 THEN thumbnail ELSE $6 END, failures = 0,
+             parts = CASE WHEN bytes = $5 THEN parts ELSE 0 END,
+             received = CASE WHEN bytes = $5 THEN received ELSE 0 END,
+             disk = disk + $7
+             WHERE vehicle = $1 AND name = $2 AND sha256 = '' AND state = 'failed'";
+            vehicle, name, sha256, text, int(facts.bytes),
+            facts.thumbnail.as_deref().unwrap_or(""), text.len() as i64 - text_before.len() as i64);
+        if is_read.rows_affected() == 0 && sha256_before != sha256 {
+            tracing::warn!(vehicle, clip = name, "a clip was announced again, as another file");
+        }
+        Ok(())
+    }
+
+    /// Notes that a file is not on its vehicle any more.
+    async fn lose_clip(
+        &mut self,
+        vehicle: &str,
+        name: &ClipName,
+        reason: &str,
+        is_thumbnail: bool,
+    ) -> CloudResult<()> {
+        let (name, reason) = (name.as_str(), visible(&excerpt(reason)));
+        if is_thumbnail {
             run!(&mut *self.tx;
                 "UPDATE clips SET thumbnail = '' WHERE vehicle = $1 AND name = $2
                  AND has_thumbnail = 0";
                 vehicle, name);
-            return Ok(false);
+            return Ok(());
         }
-        let lost = run!(&mut *self.tx;
-            "UPDATE clips SET state = 'gone', reason = $3, parts = 0
+        self.note_removed(vehicle, name, false).await?;
+        run!(&mut *self.tx;
+            "UPDATE clips SET state = 'gone', reason = $3, parts = 0, received = 0
              WHERE vehicle = $1 AND name = $2 AND state IN ('vehicle', 'failed')";
             vehicle, name, reason);
-        Ok(lost.rows_affected() > 0)
+        Ok(())
     }
 
-    /// Forgets the oldest clips of a vehicle above the bound, but those whose files are stored;
-    /// returns them.
-    async fn forget_clips(
-        &mut self,
-        vehicle: &str,
-        bounds: ClipBounds,
-    ) -> CloudResult<Vec<ClipId>> {
+    /// Forgets the oldest clips of a vehicle above the bound, but those whose files are stored.
+    async fn forget_clips(&mut self, vehicle: &str, bounds: ClipBounds) -> CloudResult<()> {
         let (count,): (i64,) = one!(&mut *self.tx;
             "SELECT COUNT(*) FROM clips WHERE vehicle = $1 AND state <> 'stored'"; vehicle);
         let above = count - int(bounds.clips);
         if above <= 0 {
-            return Ok(Vec::new());
+            return Ok(());
         }
         let rows: Vec<(i64, String)> = rows!(&mut *self.tx;
             "SELECT seq, name FROM clips WHERE vehicle = $1 AND state <> 'stored'
              ORDER BY seq LIMIT $2";
             vehicle, above);
-        for (seq, _) in &rows {
+        for (seq, name) in &rows {
+            self.note_removed(vehicle, name, true).await?;
             run!(&mut *self.tx; "DELETE FROM clip_words WHERE clip = $1"; seq);
             run!(&mut *self.tx; "DELETE FROM clips WHERE seq = $1"; seq);
         }
         tracing::warn!(vehicle, clips = above, "the oldest clips of a vehicle were forgotten");
-        Ok(rows.into_iter().filter_map(|(_, name)| clip_id((name, vehicle.to_owned()))).collect())
+        Ok(())
     }
-}
-
-pub(super) fn clip_id((name, vehicle): (String, String)) -> Option<ClipId> {
-    ClipId::new(name.parse().ok()?, &vehicle).ok()
-}
-
-fn today() -> i64 {
-    now() / DAY_S
 }

@@ -56,6 +56,7 @@ mod awaited;
 mod chunks;
 mod cleaning;
 mod clip_list;
+mod clip_quotas;
 mod clips;
 mod deployments;
 mod links;
@@ -94,7 +95,8 @@ pub(crate) use address::StoreAddress;
 pub(crate) use chunks::{ChunkSizes, KeptLine, StoredChunk};
 pub(crate) use cleaning::RemovedClip;
 pub(crate) use clip_list::ClipQuery;
-pub(crate) use clips::{ClipBounds, ClipProgress};
+pub(crate) use clip_quotas::ClipBounds;
+pub(crate) use clips::{ClipProgress, StoredPart};
 pub(crate) use deployments::OfferedDeployment;
 pub(crate) use links::VehicleReport;
 pub(crate) use numbers::NUMBER_MAX;
@@ -126,6 +128,7 @@ pub(crate) const MIGRATIONS: &[&str] = &[
     include_str!("../../migrations/0014_lives.sql"),
     include_str!("../../migrations/0015_age_clock.sql"),
     include_str!("../../migrations/0016_fallbacks.sql"),
+    include_str!("../../migrations/0017_clip_bytes.sql"),
 ];
 
 const DAY_S: i64 = 86_400;

@@ -22,14 +22,13 @@ use axum::middleware::{Next, from_fn, from_fn_with_state};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
 use axum::{Json, Router};
+use gleaner_fleet::entrance::{ClientNetwork, PeerConnection};
 use gleaner_fleet::{EnrolReply, EnrolRequest, FRAME_MAX, RenewRequest};
 use hyper_util::rt::TokioIo;
 use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::handshake::server::create_response_with_body;
 use tokio_tungstenite::tungstenite::protocol::{Role, WebSocketConfig};
 
-use crate::accept::PeerConnection;
-use crate::clients::ClientNetwork;
 use crate::cloud::{Call, Cloud};
 use crate::error::{CloudError, CloudResult};
 use crate::request::{digest, in_time, parsed};

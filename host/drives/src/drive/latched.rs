@@ -104,7 +104,6 @@ fn lock(kept: &Mutex<Kept>) -> MutexGuard<'_, Kept> {
     kept.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Keeps the latched samples of a subscription.
 struct Latched {
     number: usize,
     kept: Arc<Mutex<Kept>>,

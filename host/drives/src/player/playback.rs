@@ -8,7 +8,6 @@ use tracing::warn;
 
 use crate::drive::Replay;
 
-/// State of a playback, shared with its thread.
 #[derive(Default)]
 pub(super) struct PlaybackState {
     progress: Mutex<PlaybackProgress>,

@@ -73,7 +73,6 @@ impl Sink for TopicRoute {
     }
 }
 
-/// Publishes to the subscribers of one topic.
 pub(super) struct LoopedPublisher {
     route: Arc<TopicRoute>,
     writer: Guid,

@@ -194,7 +194,6 @@ fn ending(metadata: &[u8]) -> (Damage, Vec<DiscoveredTopic>) {
     }
 }
 
-/// Encodes a map of a record.
 fn map(pairs: &[u8]) -> Vec<u8> {
     [&(pairs.len() as u32).to_le_bytes()[..], pairs].concat()
 }

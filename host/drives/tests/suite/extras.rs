@@ -18,7 +18,6 @@ fn pairs(pairs: &[(&str, &str)]) -> BTreeMap<String, String> {
     pairs.iter().map(|(key, value)| (key.to_string(), value.to_string())).collect()
 }
 
-/// Content of [`clip`].
 fn held() -> Extras {
     let attachment = |name: &str, media_type: &str, data: &[u8]| Attachment {
         name: name.to_owned(),
@@ -82,7 +81,6 @@ fn damage(read: Result<Extras, ReplayError>) -> Damage {
     }
 }
 
-/// Returns the first position of `needle` in `bytes`.
 fn find(bytes: &[u8], needle: &[u8]) -> usize {
     bytes.windows(needle.len()).position(|window| window == needle).unwrap()
 }

@@ -29,7 +29,6 @@ fn message(channel: u16, at: u64) -> Vec<u8> {
     record(5, &[head, vec![0, 1, 0, 0], (at as i64).to_le_bytes().to_vec()].concat())
 }
 
-/// Returns a chunk of the records, not compressed.
 fn chunk(records: &[Vec<u8>], first: u64, last: u64) -> Vec<u8> {
     let bytes = records.concat();
     let len = (bytes.len() as u64).to_le_bytes();

@@ -82,12 +82,10 @@ impl CdrBytes {
     }
 }
 
-/// Path of the sample drive of the project.
 pub fn sample_drive() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/data/highway_drive.mcap")
 }
 
-/// A message of a generated drive.
 #[derive(Clone, Debug)]
 pub struct Written {
     pub topic: &'static str,
@@ -128,12 +126,10 @@ pub fn drive(options: WriteOptions, messages: &[Written]) -> Vec<u8> {
 
 pub type DriveWriter = Writer<Cursor<Vec<u8>>>;
 
-/// Begins a drive of small chunks.
 pub fn begin() -> DriveWriter {
     small_chunks().create(Cursor::new(Vec::new())).unwrap()
 }
 
-/// Returns the bytes of a drive.
 pub fn finish(mut writer: DriveWriter) -> Vec<u8> {
     writer.finish().unwrap();
     writer.into_inner().into_inner()
@@ -170,7 +166,6 @@ pub fn record(opcode: u8, body: &[u8]) -> Vec<u8> {
 
 pub const MAGIC: &[u8; 8] = b"\x89MCAP0\r\n";
 
-/// Encodes a text of a record.
 pub fn text(text: &str) -> Vec<u8> {
     [&(text.len() as u32).to_le_bytes()[..], text.as_bytes()].concat()
 }
@@ -180,7 +175,6 @@ pub fn finished(records: &[Vec<u8>]) -> Vec<u8> {
     [&MAGIC[..], &records.concat(), &record(15, &[0; 4]), &record(2, &[0; 20]), MAGIC].concat()
 }
 
-/// Writes `bytes` to a new file.
 pub fn file(bytes: &[u8]) -> PathBuf {
     static NEXT: AtomicUsize = AtomicUsize::new(0);
     let name = format!("{}-{}.mcap", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
@@ -213,7 +207,6 @@ pub fn spec(topic: &str) -> TopicSpec {
     TopicSpec { topic, type_name, queue: 1, max_bytes: 1 << 20, qos: Default::default() }
 }
 
-/// Subscribes one sink to `topics`, in that order.
 pub fn listen(replay: &mut Replay, topics: &[&str]) -> Arc<MemorySink> {
     let memory = Arc::new(MemorySink::default());
     for topic in topics {
@@ -222,7 +215,6 @@ pub fn listen(replay: &mut Replay, topics: &[&str]) -> Arc<MemorySink> {
     memory
 }
 
-/// Steps to the end, or to the error.
 pub fn run(replay: &mut Replay) -> (Vec<ReplayStep>, Option<ReplayError>) {
     let mut steps = Vec::new();
     loop {
@@ -234,7 +226,6 @@ pub fn run(replay: &mut Replay) -> (Vec<ReplayStep>, Option<ReplayError>) {
     }
 }
 
-/// Steps to the end.
 #[track_caller]
 pub fn run_whole(replay: &mut Replay) -> Vec<ReplayStep> {
     let (steps, error) = run(replay);
@@ -242,7 +233,6 @@ pub fn run_whole(replay: &mut Replay) -> Vec<ReplayStep> {
     steps
 }
 
-/// Returns the damage that ended a replay, with its position.
 #[track_caller]
 pub fn damage(error: Option<ReplayError>) -> (u64, Damage) {
     match error {

@@ -158,7 +158,6 @@ pub fn decode_rgb8(
     decode(data, header, max_bytes, out, &StopCheck::new(&|| true))
 }
 
-/// Returns the format of `data` by its magic bytes.
 fn format_of(data: &[u8]) -> Result<Format, ImageError> {
     if data.starts_with(&jpeg::MAGIC) {
         Ok(Format::Jpeg)

@@ -31,7 +31,6 @@ pub(super) fn assert_close(rgb: &[u8], tolerance: u8, expected: impl Fn(usize, u
     }
 }
 
-/// Returns the header of an image of [`colour`].
 pub(super) fn rgb8_header(format: Format) -> ImageHeader {
     ImageHeader { format, width: WIDTH, height: HEIGHT, encoding: Encoding::Rgb8 }
 }
@@ -99,7 +98,6 @@ fn bytes_after_the_end_of_a_jpeg_are_ignored() {
     assert_eq!(decoded(&padded).unwrap(), decoded(BASELINE).unwrap());
 }
 
-/// Returns the position of the first marker `marker` of a JPEG.
 fn first(file: &[u8], marker: u8) -> usize {
     file.windows(2).position(|pair| pair == [0xff, marker]).unwrap()
 }

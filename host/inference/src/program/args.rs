@@ -33,6 +33,12 @@ pub(super) struct Args {
     /// may need minutes.
     #[arg(long, value_name = "SECONDS", default_value = "120", value_parser = seconds)]
     pub(super) load_max: Duration,
+    /// The starter tries each load in another process before this one loads the model.
+    #[arg(long)]
+    pub(super) trials: bool,
+    /// Time for which models are loaded and run one at a time, in s.
+    #[arg(long, value_name = "SECONDS", default_value_t = 0)]
+    pub(super) apart: u64,
 }
 
 fn seconds(text: &str) -> Result<Duration, String> {

@@ -12,6 +12,7 @@ use std::fs::File;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::time::Duration;
 
 use clap::Parser;
 use gleaner_base::{Exit, Failure};
@@ -21,7 +22,7 @@ use gleaner_protocol::inference::InferenceServer;
 use gleaner_vitals::start::{reports, stop_socket};
 use gleaner_vitals::{ReportWriter, log};
 use rustix::process::{Signal, set_parent_process_death_signal};
-use tracing::{debug, warn};
+use tracing::warn;
 
 use crate::backend::{Backend, Backends, OnnxRuntime, RtenBackend};
 use crate::engine::InferenceEngine;
@@ -82,18 +83,19 @@ fn start(
     let layers = sandbox::close(layers, has_gpu).map_err(|error| {
         Failure::caused_by(Exit::Internal, "cannot close the sandbox of the models", &error)
     })?;
-    for layer in layers.into_iter().chain([memory::limit(args.memory)]) {
-        debug!(?layer, "sandbox");
-    }
     let backends = Backends::new(Box::new(RtenBackend), onnx_runtime);
     let Args { model_max, load_max, run_max, .. } = *args;
     let limits = LoadLimits { model_max, load_max, run_max };
     let engines = args.build_engines.clone();
     let threads = ModelThreads::start(backends, limits, engines, running)
         .map_err(internal("cannot start the threads for models"))?;
+    // Their stacks, most of them never used, would count.
+    log::layers(layers.into_iter().chain([memory::limit(args.memory)]));
     let writer = ReportWriter::start(reports).map_err(internal("cannot start a thread"))?;
     let sender = writer.sender();
-    let engine = InferenceEngine::new(threads, Box::new(move |report| sender.send(report)));
+    let reports = Box::new(move |report| sender.send(report));
+    let apart = Duration::from_secs(args.apart);
+    let engine = InferenceEngine::new(threads, reports, args.trials, apart);
     let ended = engine.run(control, Some(&stop));
     writer.end();
     ended.map_err(|error| match error {

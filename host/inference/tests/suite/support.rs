@@ -14,7 +14,7 @@ use gleaner_protocol::Handover;
 use gleaner_protocol::inference::{
     AddClient, Element, GrantedModel, InferenceControl, InferenceReport, InferenceStatus,
     LoadedModel, MAX_TENSOR_BYTES, ModelCall, ModelClient, ModelEngine, ModelFault, ModelFaultKind,
-    ModelFile, ModelResult, ModelState, ModelWait, TensorInfo, TensorPlace,
+    ModelFile, ModelResult, ModelState, ModelWait, TensorInfo, TensorPlace, models_in_use,
 };
 use sha2::{Digest, Sha256};
 
@@ -31,6 +31,8 @@ pub struct ModelProgram {
     _handover: UnixStream,
     reports: Receiver<InferenceReport>,
     running: File,
+    /// That of further lambdas.
+    pub demand: Option<u64>,
 }
 
 /// A model, as the starter grants it.
@@ -62,7 +64,6 @@ impl ModelProgram {
         let (handover, stdin) = UnixStream::pair().unwrap();
         let (control, end) = InferenceControl::pair().unwrap();
         let running = tempfile::tempfile().unwrap();
-        running.set_len(128).unwrap();
         let connections = Handover {
             control: Some(end),
             running: Some(running.try_clone().unwrap().into()),
@@ -89,7 +90,7 @@ impl ModelProgram {
                 }
             }
         });
-        Self { child, control: Some(control), _handover: handover, reports, running }
+        Self { child, control: Some(control), _handover: handover, reports, running, demand: None }
     }
 
     /// Adds a lambda with its models.
@@ -116,7 +117,8 @@ impl ModelProgram {
             control.add_model(&model, file.as_fd(), None).unwrap();
         }
         let models = models.iter().map(|model| model.grant.clone()).collect();
-        let client = AddClient { name: name.to_owned(), memory: MAX_TENSOR_BYTES, models };
+        let (id, name, memory) = (name.to_owned(), name.to_owned(), MAX_TENSOR_BYTES);
+        let client = AddClient { id, name, demand: self.demand, memory, models };
         control.add_client(&client, socket.as_fd()).unwrap();
     }
 
@@ -158,10 +160,10 @@ impl ModelProgram {
 
     /// Returns the digests of the models that are being loaded and run.
     pub fn in_use(&self) -> [Option<String>; 2] {
-        [0, 64].map(|offset| {
-            let mut note = [0; 64];
-            self.running.read_exact_at(&mut note, offset).unwrap();
-            (note != [0; 64]).then(|| String::from_utf8(note.to_vec()).unwrap())
+        let notes = models_in_use(&self.running);
+        [false, true].map(|runs| {
+            let note = notes.iter().find(|note| note.contains(' ') == runs)?;
+            note.split(' ').next().map(str::to_owned)
         })
     }
 

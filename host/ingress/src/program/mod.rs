@@ -24,7 +24,7 @@ use gleaner_regions::TopicRegion;
 use gleaner_vitals::start::{reports, stop_socket};
 use gleaner_vitals::{ReportWriter, log};
 use rustix::process::{Signal, set_parent_process_death_signal};
-use tracing::{debug, warn};
+use tracing::warn;
 
 use crate::Ingress;
 use args::{Args, IngressCommand};
@@ -69,7 +69,7 @@ fn start(args: Args) -> Result<(), Failure> {
     // Before there are other threads, and before it is denied.
     let real_time = args.real_time && enter_real_time();
     // Threads that exist already would keep their privileges.
-    let layers = sandbox::start(&args.paths());
+    let layers = sandbox::start(&args.paths(), real_time);
     // A starter that dies also closes the control connection.
     set_parent_process_death_signal(Some(Signal::TERM))
         .map_err(io::Error::from)
@@ -84,9 +84,7 @@ fn start(args: Args) -> Result<(), Failure> {
     let layers = sandbox::close(layers, new_sockets).map_err(|error| {
         Failure::caused_by(Exit::Internal, "cannot close the sandbox of the ingress", &error)
     })?;
-    for layer in layers {
-        debug!(?layer, "sandbox");
-    }
+    log::layers(layers);
     let writer = ReportWriter::start(reports).map_err(internal("cannot start a thread"))?;
     let sender = writer.sender();
     let ingress = Ingress::new(source, Box::new(move |report| sender.send(report)));

@@ -14,15 +14,11 @@ use crate::error::RecordError;
 
 /// The folder of the clips, within the output folder.
 pub(super) const CLIPS: &str = "clips";
-/// Suffix of a complete clip.
 pub(super) const CLIP: &str = ".mcap";
-/// Suffix of an unfinished clip.
 pub(super) const PART: &str = ".mcap.part";
 /// Suffix of a recovered copy of an unfinished clip, in progress.
 pub(super) const AGAIN: &str = ".mcap.part2";
-/// Suffix of a thumbnail.
 pub(super) const JPG: &str = ".jpg";
-/// Suffix of an unfinished thumbnail.
 pub(super) const JPG_PART: &str = ".jpg.part";
 
 /// Maximum length of a name without its suffix, in bytes; file systems allow 255 with it.
@@ -70,7 +66,6 @@ impl ClipDir {
         Arc::clone(&self.unsigned)
     }
 
-    /// Returns the folder, `OUT/clips`.
     pub(super) fn folder(&self) -> &Path {
         &self.folder
     }
@@ -93,7 +88,6 @@ impl ClipDir {
         Ok(())
     }
 
-    /// Reserves a name.
     pub(super) fn take(&self, name: &str) {
         self.taken().insert(format!("{name}{CLIP}"));
     }
@@ -153,10 +147,5 @@ mod tests {
         assert_eq!(sanitized(".."), "clip");
         assert_eq!(sanitized("é\0\n"), "---");
         assert_eq!(sanitized(&"x".repeat(1000)).len(), BASE_MAX);
-    }
-
-    #[test]
-    fn names_count_up() {
-        assert_eq!(names("a").take(3).collect::<Vec<_>>(), ["a", "a-2", "a-3"]);
     }
 }

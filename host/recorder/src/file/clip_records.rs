@@ -16,13 +16,10 @@ use super::{ClipHeader, ClipTrailer};
 pub(super) const LIBRARY: &str = concat!("gleaner ", env!("CARGO_PKG_VERSION"));
 /// The record before the messages.
 pub(super) const BEGIN: &str = "gleaner.begin";
-/// The record with the line of the list.
 pub(super) const CLIP_RECORD: &str = "gleaner.clip";
 pub(super) const TOPIC_RECORD: &str = "gleaner.topic";
 pub(super) const LAMBDA_RECORD: &str = "gleaner.lambda";
-/// The record of a trigger or a command.
 pub(super) const DECISION_RECORD: &str = "gleaner.decision";
-/// The attachment with the thumbnail.
 pub(super) const THUMBNAIL: &str = "thumbnail.jpg";
 /// Key of [`CLIP_RECORD`]: the line of the list, without fields that only the finished file has.
 pub(super) const LINE: &str = "line";
@@ -94,7 +91,6 @@ fn topics(trailer: &ClipTrailer, written: &Written) -> Vec<ClipTopic> {
     topics
 }
 
-/// Returns the name of the attachment with a journal.
 pub(super) fn journal(name: &str) -> String {
     format!("journal/{name}.journal")
 }
@@ -131,7 +127,6 @@ pub(super) fn read_recovered_from(metadata: &BTreeMap<String, String>) -> Option
     metadata.get(RECOVERED_FROM).map(String::as_str)
 }
 
-/// Returns the records after the messages.
 pub(super) fn records<'a>(
     trailer: &'a ClipTrailer,
     clip: &'a Clip,
@@ -197,7 +192,6 @@ pub(super) fn topic(topic: &ClipTopic, found: Option<&WrittenTopic>) -> Metadata
     (TOPIC_RECORD.to_owned(), metadata)
 }
 
-/// Returns the record of a lambda, with the header of its journal.
 pub(super) fn lambda(lambda: &ClipLambda, header: Option<&JournalHeader>) -> MetadataRecord {
     let model = |model: &FileDigest| format!("{}={}", model.path, model.sha256);
     let metadata = pairs([
@@ -219,7 +213,6 @@ pub(super) fn lambda(lambda: &ClipLambda, header: Option<&JournalHeader>) -> Met
     (LAMBDA_RECORD.to_owned(), metadata)
 }
 
-/// Returns the record of a trigger or a command.
 pub(super) fn decision(moment: &Moment) -> MetadataRecord {
     let mut metadata = pairs([
         ("at_ns", moment.at_ns.to_string()),

@@ -95,7 +95,6 @@ pub struct TopicSchema {
 }
 
 impl TopicSchema {
-    /// Returns the definitions of the layout with this number.
     pub(crate) fn layout(&self, number: u16) -> Option<&Arc<str>> {
         match number.checked_sub(1) {
             None => self.definitions.as_ref(),
@@ -136,7 +135,6 @@ pub(crate) struct ClipTrailer {
     /// The journal headers of these lambdas, in the same order; empty if unknown. Two may have one
     /// name: a restarted lambda.
     pub headers: Vec<Arc<JournalHeader>>,
-    /// Triggers within it.
     pub triggers: u64,
     /// These triggers, or as many as were kept.
     pub moments: Vec<Moment>,

@@ -5,7 +5,6 @@ use std::path::Path;
 
 use gleaner_base::safe_file;
 
-/// The writer of a file.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub(super) enum Origin {
     /// A recorder; its header is complete.

@@ -153,7 +153,6 @@ pub(super) fn clip_header(path: &Path) -> Option<ClipHeader> {
         .and_then(|(_, metadata)| read_begin(metadata).ok())
 }
 
-/// Returns the file that the clip `path` was recovered from, if it was.
 pub(super) fn recovered_from(path: &Path) -> Option<String> {
     let extras = read_extras(path, EXTRAS_BYTES).ok()?;
     let (_, metadata) = extras.metadata.iter().find(|(name, _)| name == CLIP_RECORD)?;

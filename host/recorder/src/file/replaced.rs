@@ -18,7 +18,6 @@ const NOTE: &str = ".replaced";
 /// Name of the file while it is written.
 const NOTE_PART: &str = ".replaced.part";
 
-/// Notes that these clips will be deleted.
 pub(super) fn note(folder: &Path, clips: &[ListedClip]) -> Result<(), RecordError> {
     if clips.is_empty() {
         return Ok(());

@@ -25,7 +25,6 @@ use super::{ClipHeader, read};
 use crate::error::RecordError;
 use crate::{LAMBDAS_MAX, lambda_digest};
 
-/// Values of a metadata record.
 type Values = BTreeMap<String, String>;
 
 const RECORDS: [&str; 5] = [BEGIN, CLIP_RECORD, TOPIC_RECORD, LAMBDA_RECORD, DECISION_RECORD];
@@ -229,7 +228,6 @@ fn malformed(record: &str, key: &str, values: &Values) -> FalseStatement {
     )
 }
 
-/// Parses the clip from its line.
 fn clip(
     values: &Values,
     attachments: &[Attachment],

@@ -60,7 +60,6 @@ pub(crate) struct UnfinishedClip {
     written: Written,
 }
 
-/// The open chunk.
 #[derive(Copy, Clone)]
 struct Chunk {
     first_ns: i64,
@@ -321,7 +320,6 @@ impl UnfinishedClip {
         self.written.messages()
     }
 
-    /// Returns the stamps of the first and the last message.
     pub(super) fn span(&self) -> Option<(i64, i64)> {
         self.written.span
     }

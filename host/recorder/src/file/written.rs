@@ -31,7 +31,6 @@ impl WrittenTopic {
     }
 }
 
-/// The messages of a clip, by topic.
 #[derive(Debug, Default)]
 pub(super) struct Written {
     /// In the order in which they were added.
@@ -54,7 +53,6 @@ impl Written {
         index
     }
 
-    /// Adds the definitions of a layout of the topic with this index.
     pub(super) fn add_definitions(&mut self, topic: usize, text: &str) {
         // Readers trim definitions.
         let text = text.trim();
@@ -63,7 +61,6 @@ impl Written {
         }
     }
 
-    /// Counts a message of the topic with this index.
     pub(super) fn count(&mut self, topic: usize, meta: &SampleMeta, cdr: &[u8]) {
         let topic = &mut self.topics[topic];
         topic.messages += 1;
@@ -94,7 +91,6 @@ pub(super) fn stamp(ns: i64) -> u64 {
     u64::try_from(ns).unwrap_or(0)
 }
 
-/// Returns the four bytes before a payload.
 pub(super) fn encapsulation(meta: &SampleMeta) -> [u8; 4] {
     let endian = u8::from(matches!(meta.endian, Endian::Little));
     [0, endian, meta.options[0], meta.options[1]]

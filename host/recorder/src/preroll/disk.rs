@@ -17,7 +17,6 @@ use tracing::warn;
 use super::{EntryId, EntryMeta};
 use crate::RecordError;
 
-/// Cost of an entry in the index.
 const INDEXED: u64 = size_of::<Indexed>() as u64;
 
 /// Maximum number of entries in the index, so that small samples in a large store do not fill the
@@ -314,7 +313,6 @@ impl Drop for Disk {
     }
 }
 
-/// Creates the chunk `path`.
 fn begin(path: &Path) -> io::Result<File> {
     // A test uses links to a full disk.
     #[cfg(test)]
@@ -328,7 +326,6 @@ fn path_of(folder: &Path, number: u64) -> PathBuf {
     folder.join(format!("{number}.chunk"))
 }
 
-/// Returns whether a file has the name of a chunk.
 fn is_chunk(path: &Path) -> bool {
     let name = path.file_name().and_then(|name| name.to_str());
     let number = name.and_then(|name| name.strip_suffix(".chunk"));

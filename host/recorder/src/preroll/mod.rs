@@ -53,10 +53,8 @@ impl EntrySource {
     }
 }
 
-/// The metadata of an entry.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct EntryMeta {
-    /// Source of the entry.
     pub source: EntrySource,
     /// Length of the entry, in bytes.
     pub len: u32,
@@ -72,14 +70,11 @@ pub struct EntryMeta {
     pub writer: [u8; 16],
     /// Options of the encapsulation.
     pub options: [u8; 2],
-    /// Byte order.
     pub is_big_endian: bool,
-    /// Number of the layout.
     pub layout: u16,
 }
 
 impl EntryMeta {
-    /// Creates the metadata of a sample of a topic.
     pub fn sample(topic: usize, meta: &SampleMeta, group: u64) -> EntryMeta {
         EntryMeta {
             source: EntrySource::topic(topic),
@@ -111,7 +106,6 @@ impl EntryMeta {
         }
     }
 
-    /// Returns the metadata of the sample.
     pub fn meta(&self) -> SampleMeta {
         SampleMeta {
             publish_ns: self.publish_ns,
@@ -143,7 +137,6 @@ impl Walked {
     }
 }
 
-/// The preroll buffer.
 pub struct Preroll {
     kind: PrerollStore,
     highest: u64,
@@ -284,7 +277,6 @@ impl Preroll {
         }
     }
 
-    /// Returns the newest entry.
     pub fn newest(&self) -> Option<Walked> {
         let (place, entries) = match &self.kind {
             PrerollStore::Ram(ram) => (ram.newest()?, ram.entries()),
@@ -320,7 +312,6 @@ impl Preroll {
         }
     }
 
-    /// Returns the metadata of an entry.
     pub fn held(&self, place: EntryId) -> EntryMeta {
         match &self.kind {
             PrerollStore::Ram(ram) => ram.held(place),

@@ -30,7 +30,6 @@ pub struct SystemHealth {
     pub cpu_s: f64,
 }
 
-/// The thread.
 pub struct Background {
     pub sources: Sources,
     pub requests: Receiver<DefinitionsRequest>,

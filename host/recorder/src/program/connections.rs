@@ -48,7 +48,6 @@ pub struct Registration {
     pub replies: LambdaReplies,
 }
 
-/// A message of a lambda.
 pub enum LambdaEvent {
     /// The header of the lambda matches the announcement.
     Hello(Box<JournalHeader>),
@@ -62,7 +61,6 @@ pub enum LambdaEvent {
     },
     /// The engine, in place of that in the header.
     Engine(String),
-    /// The connection is closed.
     Closed(Option<LinkError>),
 }
 
@@ -155,7 +153,6 @@ fn read_link(
     }
 }
 
-/// A lambda as the starter announced it.
 struct ExpectedLambda {
     manifest: Manifest,
     /// SHA-256 of its `lambda.toml`, in hexadecimal digits.
@@ -164,7 +161,6 @@ struct ExpectedLambda {
 }
 
 impl ExpectedLambda {
-    /// Returns how `header` differs, if it is of another lambda.
     fn differs(&self, header: &JournalHeader) -> Option<String> {
         let lambda = &self.manifest.lambda;
         let text = |what: &str, wanted: &str, found: &str| {

@@ -252,7 +252,6 @@ impl RecorderLoop {
         Ok(())
     }
 
-    /// Handles messages of lambdas.
     fn lambdas(&mut self) -> Result<bool, Failure> {
         self.roster.poll(self.clock, &mut self.recorder, self.commands.as_mut())
     }

@@ -42,7 +42,6 @@ pub struct ConnectedLambda {
     is_warned: bool,
 }
 
-/// The result of [`ConnectedLambda::poll`].
 #[derive(Copy, Clone, Debug, Default)]
 pub struct PollResult {
     /// True if there was a message.
@@ -51,7 +50,6 @@ pub struct PollResult {
     pub is_new: Option<LambdaId>,
     /// True if it is refused. The reason was sent to it and logged.
     pub is_refused: bool,
-    /// True if its connection is closed.
     pub is_gone: bool,
     /// Counts of wakes that are not recorded, and their triggers.
     pub counted: RecordingCounts,

@@ -45,7 +45,6 @@ use gleaner_trust::{ClipSigner, SecretKey, VehicleName};
 use gleaner_vitals::log;
 use gleaner_vitals::start::{reports, stop_flag};
 use rustix::process::{Signal, set_parent_process_death_signal};
-use tracing::debug;
 
 use crate::RecordError;
 use args::Args;
@@ -105,9 +104,7 @@ fn start(args: Args) -> Result<(), Failure> {
     // First: threads that exist already would keep their privileges. The folder must exist.
     safe_file::folder(&args.out)
         .map_err(|source| RecordError::Create { path: args.out.clone(), source })?;
-    for layer in sandbox::enter(std::slice::from_ref(&args.out)) {
-        debug!(?layer, "sandbox");
-    }
+    log::layers(sandbox::enter(std::slice::from_ref(&args.out)));
     // A starter that dies also closes our standard input. In either case, open clips are completed.
     set_parent_process_death_signal(Some(Signal::TERM))
         .map_err(io::Error::from)

@@ -23,7 +23,6 @@ pub struct Roster {
     lambdas: Vec<ConnectedLambda>,
     /// For each lambda that ever came: the requested store and bytes of the preroll.
     shares: BTreeMap<String, (Store, u64)>,
-    /// Bytes of the preroll, if they are given.
     preroll_bytes: Option<u64>,
     /// Times from decisions to open windows.
     spreads: IntervalDurations,
@@ -60,7 +59,6 @@ impl Roster {
         &mut self.spreads
     }
 
-    /// Counts a lambda that was announced and refused.
     pub fn count_refused(&mut self) {
         self.counted.lambdas_refused += 1;
     }

@@ -81,7 +81,6 @@ impl FedSamples {
         self.fed.info.offered_qos.as_deref()
     }
 
-    /// Number of samples read.
     pub fn received(&self) -> u64 {
         self.received
     }

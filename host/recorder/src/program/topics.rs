@@ -40,14 +40,12 @@ enum Description {
     Settled,
 }
 
-/// The samples of a granted topic.
 enum Supply {
     /// Not attached yet.
     Awaited,
     Fed(Box<FedRecording>),
 }
 
-/// A topic that is attached.
 struct FedRecording {
     samples: FedSamples,
     description: Description,
@@ -63,7 +61,6 @@ struct FedRecording {
     described: Option<String>,
 }
 
-/// A recorded topic.
 struct GrantedTopic {
     id: u32,
     name: String,
@@ -73,7 +70,6 @@ struct GrantedTopic {
     refused: Option<String>,
 }
 
-/// The recorded topics.
 pub struct Topics {
     feed: LastingFeed,
     /// To the thread that searches definitions.
@@ -199,7 +195,6 @@ impl Topics {
         Ok(false)
     }
 
-    /// Returns the state of each topic.
     pub fn statuses(&self) -> Vec<RecordedTopic> {
         self.topics.iter().map(|topic| topic.status(self.reception(topic.id))).collect()
     }

@@ -75,7 +75,6 @@ impl History {
         &mut self.preroll
     }
 
-    /// The latest time so far.
     pub fn now(&self) -> Option<i64> {
         self.now
     }
@@ -90,13 +89,11 @@ impl History {
         self.message_bytes = most;
     }
 
-    /// Grows to `topics` topics and `lambdas` lambdas.
     pub fn grow(&mut self, topics: usize, lambdas: usize) {
         self.topics.resize_with(self.topics.len().max(topics), TopicLosses::default);
         self.wakes.resize_with(self.wakes.len().max(lambdas), Losses::default);
     }
 
-    /// Advances time.
     pub fn pass(&mut self, now: i64) {
         if self.now.is_none() {
             self.began_at = now;
@@ -104,7 +101,6 @@ impl History {
         self.now = self.now.max(Some(now));
     }
 
-    /// Keeps an entry.
     pub fn keep(&mut self, held: EntryMeta, bytes: &[u8]) -> Result<(), RecordError> {
         let is_sample = held.source.as_topic().is_some();
         let History { preroll, topics, wakes, evicted_early, .. } = self;
@@ -200,7 +196,6 @@ impl History {
         }
     }
 
-    /// Counts wakes that did not arrive.
     pub fn lost_wakes(&mut self, lambda: usize, at_ns: i64, count: u64) {
         self.wakes[lambda].lost.add_some(at_ns, 0, count);
     }

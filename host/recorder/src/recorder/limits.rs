@@ -5,7 +5,6 @@ use crate::file::MESSAGE_MAX;
 /// Limits that only tests change.
 #[derive(Copy, Clone, Debug)]
 pub struct RecorderLimits {
-    /// The longest message.
     pub message_bytes: usize,
     /// Most triggers that a clip lists; it counts all.
     pub moments: usize,

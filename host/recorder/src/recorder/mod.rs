@@ -39,7 +39,6 @@ pub(crate) use live::counted;
 pub use settings::{Commanded, LambdaId, RecorderCounts, Settings, TopicId, Work};
 pub use sources::{LambdaSpec, TOPICS_MAX};
 
-/// The data that clips are made of.
 struct Material {
     sources: RecordedSources,
     history: History,
@@ -58,7 +57,6 @@ pub struct Recorder {
     material: Material,
     clips: Clips,
     counts: RecorderCounts,
-    /// Buffer for an encoded wake.
     encoded: Vec<u8>,
     settings: Settings,
     /// Number of clips that could not be signed.

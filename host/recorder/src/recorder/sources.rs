@@ -40,7 +40,6 @@ struct SourceTopic {
     is_missing: bool,
     /// The time when it was found, if later than requested.
     found_at: Option<i64>,
-    /// True once it had a sample.
     has_samples: bool,
     /// The depth of its writers, if it is latched.
     latched: Option<usize>,
@@ -62,9 +61,7 @@ struct SourceLambda {
     wakes: u64,
 }
 
-/// The topics and lambdas, by their numbers.
 pub struct RecordedSources {
-    /// The clock of the stamps.
     clock: String,
     /// True if its samples have writers.
     is_live: bool,
@@ -141,7 +138,6 @@ impl RecordedSources {
         Ok(())
     }
 
-    /// Adds a lambda as number `lambda`, the next one.
     pub fn add_lambda(&mut self, lambda: usize, spec: LambdaSpec) {
         let LambdaSpec { header, digest, topics, .. } = spec;
         let topics: Vec<usize> = topics.iter().map(|topic| topic.index()).collect();
@@ -156,7 +152,6 @@ impl RecordedSources {
         self.lambdas.push(SourceLambda { header, digest, topics, encoder, wakes: 0 });
     }
 
-    /// Returns whether there is room for one more lambda.
     pub fn check_room(&self) -> Result<(), RecordError> {
         match self.lambdas.len() < LAMBDAS_MAX {
             true => Ok(()),
@@ -188,12 +183,10 @@ impl RecordedSources {
         self.topics[topic].found_at
     }
 
-    /// Notes that a topic has a sample.
     pub fn saw(&mut self, topic: usize) {
         self.topics[topic].has_samples = true;
     }
 
-    /// Returns whether a topic ever had a sample.
     pub fn has_seen(&self, topic: usize) -> bool {
         self.topics[topic].has_samples
     }
@@ -207,7 +200,6 @@ impl RecordedSources {
         &self.topics[topic].schema
     }
 
-    /// The first of these topics that has images.
     pub fn first_with_images(&self, topics: Vec<usize>) -> Option<usize> {
         let has_images = |topic: &usize| {
             let topic = &self.topics[*topic];
@@ -229,7 +221,6 @@ impl RecordedSources {
         &self.lambdas[lambda].header.lambda
     }
 
-    /// The topics of a lambda.
     pub fn topics(&self, lambda: usize) -> &[usize] {
         &self.lambdas[lambda].topics
     }
@@ -250,7 +241,6 @@ impl RecordedSources {
         topics
     }
 
-    /// The lambdas of a clip.
     pub fn lambdas_of(&self, group: &Group) -> Vec<ClipLambda> {
         let lambda = |lambda: &usize| {
             let SourceLambda { header, digest, .. } = &self.lambdas[*lambda];

@@ -5,7 +5,6 @@ use gleaner_lambda::TriggerKind::{Event, Start};
 use super::*;
 use crate::support::*;
 
-/// A recorder of one topic and one lambda, with these limits.
 fn recorder(
     scratch: &TestDir,
     rolls_ms: (i64, i64, i64),

@@ -127,7 +127,6 @@ impl Group {
         self.shares.get(lambda).map_or(0, |share| share.windows)
     }
 
-    /// Returns whether a window waits for its stop.
     pub fn waits_for_stop(&self) -> bool {
         self.to == i64::MAX
     }

@@ -1,6 +1,5 @@
 //! Sets of instants, as sorted, disjoint intervals with both ends inclusive.
 
-/// A set of instants.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Intervals(Vec<(i64, i64)>);
 
@@ -23,14 +22,12 @@ impl Intervals {
         self.0.splice(first..last, [merged]);
     }
 
-    /// Returns whether `at` is in the set.
     pub fn contains(&self, at: i64) -> bool {
         self.0
             .get(self.0.partition_point(|(_, end)| *end < at))
             .is_some_and(|(begin, _)| *begin <= at)
     }
 
-    /// Returns the first instant of `from..=to` that is not in the set.
     pub fn first_outside(&self, from: i64, to: i64) -> Option<i64> {
         match self.0.get(self.0.partition_point(|(_, end)| *end < from)) {
             Some((begin, end)) if *begin <= from => (*end < to).then(|| end.saturating_add(1)),
@@ -38,7 +35,6 @@ impl Intervals {
         }
     }
 
-    /// Returns the latest instant.
     pub fn end(&self) -> Option<i64> {
         self.0.last().map(|(_, end)| *end)
     }

@@ -6,7 +6,6 @@ use gleaner_lambda::TriggerKind;
 
 use super::{Group, Window, WindowRules};
 
-/// The outcome of a trigger.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum TriggerOutcome {
     /// The trigger opened a window, or began a recording within the window of another recording.
@@ -19,7 +18,6 @@ pub enum TriggerOutcome {
     Ignored,
     /// A start while [`STARTED_MAX`] are open.
     TooManyStarted,
-    /// Too many windows wait.
     TooManyWaiting,
 }
 
@@ -37,7 +35,6 @@ pub enum WindowStep {
     Begin(Vec<Window>),
     /// These windows have joined the open clip.
     Join {
-        /// The windows.
         windows: Vec<Window>,
         /// The first instant up to now that they cover and the clip did not: only later entries
         /// have to be searched.

@@ -33,11 +33,9 @@ pub struct WindowRules {
 /// An interval to keep for one lambda.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct Window {
-    /// The lambda.
     pub lambda: usize,
     /// Stamp of the trigger.
     pub anchor: i64,
-    /// First instant of the interval.
     pub from: i64,
     /// Last instant of the interval; `None` until the stop.
     pub to: Option<i64>,

@@ -45,7 +45,6 @@ fn groups(windows: &mut Windows, triggers: &[(i64, TriggerKind)]) -> Vec<(i64, i
     spans(&finished)
 }
 
-/// Returns the begins and ends of groups.
 fn spans(groups: &[Group]) -> Vec<(i64, i64)> {
     groups.iter().map(|group| (group.begin, group.to)).collect()
 }

@@ -51,7 +51,6 @@ fn child() {
     }
 }
 
-/// Reports with complete lines.
 fn reports(out: &Path) -> Vec<RecorderReport> {
     let text = fs::read_to_string(out.join("reports.jsonl")).unwrap_or_default();
     let whole = text.split_inclusive('\n').filter(|line| line.ends_with('\n'));

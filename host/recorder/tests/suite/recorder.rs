@@ -6,7 +6,7 @@ use crate::support::*;
 use gleaner_base::Explain;
 use gleaner_lambda::TriggerKind::{Event, Start, Stop};
 use gleaner_protocol::RecordingCounts;
-use gleaner_recorder::{RecordError, RecordingFolder, TOPICS_MAX, TopicSchema};
+use gleaner_recorder::{RecordError, TOPICS_MAX, TopicSchema};
 
 const EVENT: &[gleaner_lambda::TriggerKind] = &[Event];
 
@@ -388,17 +388,6 @@ fn a_silent_topic_has_a_channel_and_a_missing_one_has_none() {
     assert_eq!(scratch.channels(clip), ["/a", "/silent"]);
     assert_eq!(clip.topics.iter().map(|topic| topic.messages).collect::<Vec<_>>(), [21, 0, 0]);
     assert_eq!((scratch.channels(without), without.first_ns), (vec!["/silent".to_owned()], None));
-}
-
-#[test]
-fn the_written_data_of_a_recorder_that_dies_is_recovered() {
-    let (scratch, mut recorder) = TestDir::recording();
-    let (a, lambda) = add_hello(&mut recorder, (500, 500, 0));
-    drive(&mut recorder, &[a], (0, 3000, 10), &[(2000, lambda, &[Start])]);
-    drop(recorder);
-    let (_folder, recovered) = RecordingFolder::open(&scratch.0).unwrap();
-    assert_eq!((recovered.len(), recovered[0].lambdas[0].name.as_str()), (1, "hello"));
-    assert!(recovered[0].recovered.is_some());
 }
 
 #[test]

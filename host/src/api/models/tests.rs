@@ -12,6 +12,7 @@ use rustix::fs::{MemfdFlags, ftruncate, memfd_create};
 use rustix::net::{SendFlags, send};
 
 use super::*;
+use crate::api::call_time::CallTime;
 
 /// `memory` of the lambda.
 const MEMORY: u64 = 1 << 20;
@@ -198,8 +199,7 @@ fn a_start_of_the_process_without_its_end_makes_the_lambda_open_its_models_again
             server.reply(&ModelReply { id: index, region: 0, result }, None).unwrap();
         }
     });
-    let due = Due::default();
-    let open = || models.lock().open("m", &due).unwrap();
+    let open = || models.lock().open("m", None).unwrap();
     open();
     report_state(&starter, None).unwrap();
     models.lock().connection.as_mut().unwrap().check_process(None).unwrap();
@@ -247,7 +247,7 @@ fn calls_of_a_guest_without_due_times_end_with_its_call() {
     let (lambda, _other) = ModelClient::pair().unwrap();
     let entry = ModelEntry { name: "m".to_owned(), layout: None, labels: Vec::new() };
     let models = Models::new(vec![entry], Some(lambda), MEMORY);
-    models.end_at(Some(Instant::now()));
+    models.end_with(Some(CallTime::begin(Duration::ZERO)));
     let opened = models.open("m", &Due::default());
     assert!(matches!(opened, Err(InferenceError::OutOfTime)), "nothing replies");
 }

@@ -1,10 +1,11 @@
 //! Time that the models of a wake take.
 
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use super::Models;
 use crate::api::call::Due;
+use crate::api::call_time::CallTime;
 
 /// Run time of the models in the current wake. No call waits for another one to read it.
 #[derive(Default)]
@@ -33,10 +34,10 @@ impl Models {
         self.time.used_ns.load(Ordering::Relaxed)
     }
 
-    /// Ends calls at this time, also for a guest that gives its calls no due time, as Python does:
+    /// Ends calls with this one, also for a guest that gives its calls no due time, as Python does:
     /// a signal interrupts no call into the host. `None` for no deadline.
-    pub fn end_at(&self, at: Option<Instant>) {
-        self.time.due.set(at);
+    pub fn end_with(&self, call: Option<CallTime>) {
+        self.time.due.set(call);
     }
 }
 

@@ -1,5 +1,5 @@
-//! Wall-clock deadlines: a thread checks whether a call is overdue, and then advances the engine's
-//! epoch, at which the guest traps.
+//! Deadlines of components: a thread checks whether a call may be overdue, and then advances the
+//! engine's epoch, at which the guest traps if the call has used its time.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use wasmtime::{Engine, Store, Trap, UpdateDeadline};
 
 use super::Hosted;
-use crate::guest::is_late;
+use crate::api::call_time::CallTime;
 
 /// Idle time after which the ticker sleeps until the next call. A lambda at 1 Hz wakes it with each
 /// call, one at 100 Hz never: waking a thread costs a call more than the rest of hosting.
@@ -26,37 +26,16 @@ pub struct Deadline {
 
 struct TickerState {
     base: Instant,
-    /// Due time of the current call, in ns since `base`.
+    /// Time of the first check of the current call, in ns since `base`.
     due: AtomicU64,
     /// Set while the ticker sleeps until it is woken.
     sleeps: AtomicBool,
     stop: AtomicBool,
 }
 
-/// Duration of a call, and its limit.
-#[derive(Clone, Copy)]
-pub(super) struct CallTime {
-    elapsed: Duration,
-    allowed: Duration,
-}
-
-impl CallTime {
-    /// Returns whether the call returned too late. An epoch does not interrupt an instruction that
-    /// fills or copies a large memory, and no check follows if it is the last one.
-    pub(super) fn is_late(self) -> bool {
-        is_late(self.elapsed, self.allowed)
-    }
-
-    /// Both, in nanoseconds.
-    pub(super) fn elapsed_and_allowed(self) -> (u64, u64) {
-        (self.elapsed.as_nanos() as u64, self.allowed.as_nanos() as u64)
-    }
-}
-
 pub(super) struct ArmedCall<'a> {
     deadline: &'a Deadline,
-    started: Instant,
-    allowed: Duration,
+    pub(super) time: CallTime,
 }
 
 impl Deadline {
@@ -81,16 +60,16 @@ impl Deadline {
 
     /// Begins a call that may take `allowed`.
     pub(super) fn arm(&self, store: &mut Store<Hosted>, allowed: Duration) -> ArmedCall<'_> {
-        let started = Instant::now();
-        store.data_mut().due = Some(started + allowed);
+        let time = CallTime::begin(allowed);
+        store.data_mut().call = Some(time);
         store.set_epoch_deadline(1);
-        let due = started.duration_since(self.shared.base) + allowed;
+        let due = time.first_check().duration_since(self.shared.base);
         self.shared.due.store((due.as_nanos() as u64).max(NONE + 1), Ordering::SeqCst);
         // Either the ticker sees the call before it sleeps, or this thread sees that it sleeps.
         if self.shared.sleeps.load(Ordering::SeqCst) {
             self.wake();
         }
-        ArmedCall { deadline: self, started, allowed }
+        ArmedCall { deadline: self, time }
     }
 
     fn wake(&self) {
@@ -116,7 +95,7 @@ impl TickerState {
                     engine.increment_epoch();
                 }
                 // A call into the host ends by itself; the epoch is checked when it returns to the
-                // guest.
+                // guest. A guest that had to wait for a core has time left, and is checked again.
                 thread::park_timeout(left.clamp(Duration::from_micros(500), step));
             } else if now.duration_since(quiet) < IDLE {
                 thread::park_timeout(step);
@@ -132,11 +111,11 @@ impl TickerState {
     }
 }
 
-/// Sets the callback of a guest at which the epoch advances: it traps only if its own call is due,
-/// since the ticker may have meant an earlier one.
-pub(super) fn check_due_at_epoch(store: &mut Store<Hosted>) {
-    store.epoch_deadline_callback(|context| match context.data().due {
-        Some(due) if Instant::now() < due => Ok(UpdateDeadline::Continue(1)),
+/// Sets the callback of a guest at which the epoch advances: it traps only if its own call has no
+/// time left, since the ticker may have meant an earlier one.
+pub(super) fn check_time_at_epoch(store: &mut Store<Hosted>) {
+    store.epoch_deadline_callback(|context| match context.data().call {
+        Some(call) if !call.left(Duration::ZERO).is_zero() => Ok(UpdateDeadline::Continue(1)),
         _ => Err(Trap::Interrupt.into()),
     });
 }
@@ -148,13 +127,6 @@ impl Drop for Deadline {
         if let Some(ticker) = self.ticker.take() {
             let _ = ticker.join();
         }
-    }
-}
-
-impl ArmedCall<'_> {
-    /// Time for which the call has been running, and its limit.
-    pub(super) fn taken(&self) -> CallTime {
-        CallTime { elapsed: self.started.elapsed(), allowed: self.allowed }
     }
 }
 

@@ -9,6 +9,7 @@ use wasmtime_wasi::I32Exit;
 use super::Hosted;
 use super::limits::RefusedGrowth;
 use super::wasi::SleepError;
+use crate::api::call_time::TimeUsed;
 use crate::api::data::DataError;
 use crate::api::fuel::OutOfFuel;
 
@@ -21,13 +22,6 @@ pub(super) fn fuel(used: u64, allowed: u64) -> Fault {
     Fault { kind: FaultKind::Fuel, message, used: Some(used), allowed: Some(allowed) }
 }
 
-pub(super) fn deadline(time: Option<(u64, u64)>) -> Fault {
-    let (used, allowed) = time.unzip();
-    let ms = |ns: Option<u64>| ns.unwrap_or(0) as f64 / 1e6;
-    let message = format!("ran {:.1} ms; the deadline is {:.1} ms", ms(used), ms(allowed));
-    Fault { kind: FaultKind::Deadline, message, used, allowed }
-}
-
 fn memory(&RefusedGrowth { limit, requested, allowed }: &RefusedGrowth) -> Fault {
     let [most, allows] = [requested, allowed].map(|amount| match limit {
         "memory" => format!("{:.1} MiB", amount as f64 / 1_048_576.0),
@@ -37,12 +31,12 @@ fn memory(&RefusedGrowth { limit, requested, allowed }: &RefusedGrowth) -> Fault
     Fault { kind: FaultKind::Memory, message, used: Some(requested), allowed: Some(allowed) }
 }
 
-/// Converts an error of a call. The pairs are fuel, and time in ns: used and allowed.
+/// Converts an error of a call that has used this time. The pair is fuel: used and allowed.
 pub(super) fn from_error(
     error: &wasmtime::Error,
     hosted: &Hosted,
     (used, allowed): (u64, u64),
-    time: Option<(u64, u64)>,
+    time: TimeUsed,
 ) -> Fault {
     let trap = error.downcast_ref::<Trap>();
     let data = error.downcast_ref::<DataError>();
@@ -52,13 +46,10 @@ pub(super) fn from_error(
         return fuel(used, allowed);
     }
     if trap == Some(&Trap::Interrupt) {
-        return deadline(time);
+        return time.fault("");
     }
     if let Some(DataError::OutOfTime) = data {
-        let (used, allowed) = time.unzip();
-        let message =
-            "a call into the host takes longer than is left until the deadline".to_owned();
-        return Fault { kind: FaultKind::Deadline, message, used, allowed };
+        return time.fault("a call into the host takes longer than is left: ");
     }
     if trap == Some(&Trap::StackOverflow) {
         // The stack that another call would have needed is unknown.

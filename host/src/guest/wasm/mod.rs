@@ -19,7 +19,7 @@ mod wasi;
 pub use deadline::Deadline;
 pub use load::{Loaded, WasmError};
 
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use gleaner_lambda::manifest::{ConfigValue, Limits};
 use gleaner_lambda::{Fault, FaultKind};
@@ -34,6 +34,7 @@ use self::limits::Caps;
 use self::wasi::GuestOutput;
 use super::{Guest, LambdaEngine, WakeOutcome};
 use crate::api::Session;
+use crate::api::call_time::CallTime;
 use crate::api::data::Wake;
 
 /// A component and its session.
@@ -62,8 +63,8 @@ struct Hosted {
     allowed: Limits,
     caps: Caps,
     counts_fuel: bool,
-    /// Due time of the current call, if there is a deadline.
-    due: Option<Instant>,
+    /// Time of the current call, if there is a deadline.
+    call: Option<CallTime>,
 }
 
 impl WasiView for Hosted {
@@ -113,11 +114,11 @@ impl WasmGuest {
             allowed: self.limits,
             caps: Caps::new(&self.limits, self.session.fuel().clone()),
             counts_fuel: self.loaded.counts_fuel(),
-            due: None,
+            call: None,
         };
         let mut store = Store::new(self.loaded.engine(), hosted);
         store.limiter(|hosted| &mut hosted.caps);
-        deadline::check_due_at_epoch(&mut store);
+        deadline::check_time_at_epoch(&mut store);
         store.set_hostcall_fuel(self.limits.call_bytes.as_usize());
         // The resource table refuses first, with a clear error: a call lends some handles beside
         // those that are held.
@@ -207,7 +208,7 @@ impl<'a> GuestCall<'a> {
         }
         let hosted = store.data();
         if let Some(due) = hosted.session.due() {
-            due.set(hosted.due);
+            due.set(hosted.call);
         }
         Self { store, fuel, armed }
     }
@@ -227,7 +228,8 @@ impl<'a> GuestCall<'a> {
 
     /// Ends the call; returns the fuel used, and the result with a trap converted to a fault.
     fn end<T>(self, result: wasmtime::Result<T>) -> (u64, Result<T, Fault>) {
-        let taken = self.armed.as_ref().map(deadline::ArmedCall::taken);
+        let time = self.armed.as_ref().map(|armed| armed.time);
+        let late = time.as_ref().and_then(CallTime::late);
         drop(self.armed);
         self.store.data().output.end();
         let left = match self.store.data().counts_fuel {
@@ -236,13 +238,12 @@ impl<'a> GuestCall<'a> {
         };
         let used = (self.fuel - left.min(self.fuel))
             .saturating_add(self.store.data().session.fuel().used());
-        let time = taken.map(deadline::CallTime::elapsed_and_allowed);
         let result = match result {
             // Guest and host each stayed within the allowance, but their sum must as well.
             Ok(_) if used > self.fuel => Err(fault::fuel(used, self.fuel)),
-            Ok(_) if taken.is_some_and(deadline::CallTime::is_late) => Err(fault::deadline(time)),
-            Ok(value) => Ok(value),
+            Ok(value) => late.map_or(Ok(value), |time| Err(time.fault(""))),
             Err(error) => {
+                let time = time.map(|time| time.used()).unwrap_or_default();
                 Err(fault::from_error(&error, self.store.data(), (used, self.fuel), time))
             }
         };

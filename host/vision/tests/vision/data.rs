@@ -10,7 +10,6 @@ use gleaner_vision::{DetectorLayout, Placement, Preparer, Preprocess};
 
 use crate::shared_data::shared_file;
 
-/// A decoded picture.
 struct Picture {
     width: u32,
     height: u32,

@@ -282,18 +282,10 @@ fn outputs_that_do_not_fit_are_refused_with_both_shapes() {
         run(layout, shape, &vec![0.9; count], &all()).unwrap_err().to_string()
     };
     assert_eq!(
-        refusal(Yolox, &[1, 100, 85], 8500),
-        "layout `yolox` needs one output [1, 84, 5 + classes] for an input of 64x64; \
-         the model has [1, 100, 85]"
-    );
-    assert_eq!(
         refusal(Nanodet, &[1, 85, 32], 2720),
         "layout `nanodet` needs one output [1, 85, classes + 32] or [1, 84, classes + 32] \
          for an input of 64x64; the model has [1, 85, 32]"
     );
-    assert!(refusal(NmsFree, &[1, 300, 7], 2100).contains("[1, rows, 6]"));
-    assert!(refusal(Ultralytics, &[0, 0, 0], 0).contains("[0, 0, 0]"));
-    assert!(refusal(Ultralytics, &[1, 300, 90], 27_000).contains("[1, 300, 90]"));
     assert_eq!(
         refusal(Ultralytics, &[1, 80, 84], 80 * 84 - 1),
         "output [1, 80, 84] of the model has 6719 values"

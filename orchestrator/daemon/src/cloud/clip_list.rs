@@ -78,14 +78,17 @@ impl ClipFolder {
         fs::symlink_metadata(self.list()).map_or(0, |found| found.len())
     }
 
-    /// Reads the clips after the position that the cloud has; `None` if there are none. A list
-    /// that was begun again is read from its begin. `is_over` ends it early.
-    pub(super) fn new_clips(
+    /// Reads the clips after the position that the cloud has, or at the begin of the list if it is
+    /// of another one, or only the one with a name; `None` if there are none. One that cannot be
+    /// read has the cause in its facts. `is_over` ends it early.
+    pub(super) fn clips(
         &self,
         cursor: Option<&str>,
+        only: Option<&ClipName>,
         builds: &[KnownBuild],
         is_over: &dyn Fn() -> bool,
     ) -> io::Result<Option<ClipReport>> {
+        let most = if only.is_some() { 1 } else { CLIPS_IN_REPORT };
         let mut list = match safe_file::read(&self.list()) {
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
             list => list?,
@@ -99,7 +102,7 @@ impl ClipFolder {
         let mut lines = BufReader::new(list);
         let mut report = ClipReport::default();
         let (mut read, mut length) = (0, 0);
-        while report.clips.len() < CLIPS_IN_REPORT && read < READ_MAX && !is_over() {
+        while report.clips.len() < most && read < READ_MAX && !is_over() {
             let mut line = Vec::new();
             lines.by_ref().take(LINE_MAX).read_until(b'\n', &mut line)?;
             // The recorder still writes it, or a power cut tore it.
@@ -109,6 +112,7 @@ impl ClipFolder {
             let clip = serde_json::from_slice::<Clip>(&line).ok();
             let clip = clip.and_then(|clip| Some((name(&clip.file, ".mcap")?, clip)));
             match clip {
+                Some((name, _)) if only.is_some_and(|only| *only != name) => {}
                 Some((name, clip)) => {
                     let facts = self.facts(name, clip, builds, is_over)?;
                     let bytes = facts.length();
@@ -125,8 +129,11 @@ impl ClipFolder {
             offset += line.len() as u64;
             report.cursor = Some(format!("{offset}-{}-{}", line.len(), sha256(&line)));
         }
+        if only.is_some() {
+            report.cursor = None;
+        }
         // What was not read to its end is read again.
-        Ok(report.cursor.is_some().then_some(report).filter(|_| !is_over()))
+        Ok((report != ClipReport::default() && !is_over()).then_some(report))
     }
 
     fn facts(
@@ -136,13 +143,18 @@ impl ClipFolder {
         builds: &[KnownBuild],
         is_over: &dyn Fn() -> bool,
     ) -> io::Result<ClipFacts> {
-        let file = match self.open(&name) {
-            Ok(file) => Some(file),
-            Err(error) if is_gone(&error) => None,
-            Err(error) => return Err(error),
+        let mut bytes = clip.bytes.min(CLIP_MAX);
+        let read = self.open(&name).and_then(|file| {
+            bytes = file.length();
+            digest(file, is_over)
+        });
+        let (digest, unreadable) = match read {
+            Ok(digest) => (Some(digest), None),
+            Err(error) if is_gone(&error) => (None, None),
+            Err(error) if is_over() => return Err(error),
+            // A bad block of one file must not keep the others from the cloud.
+            Err(error) => (None, Some(error.to_string())),
         };
-        let bytes = file.as_ref().map_or(clip.bytes.min(CLIP_MAX), PlainFile::length);
-        let digest = file.map(|file| digest(file, is_over)).transpose()?;
         let has_image =
             clip.thumbnail.and_then(|path| self::name(&path, ".jpg")) == Some(name.clone());
         let image = if has_image { self.thumbnail(&name).ok() } else { None };
@@ -180,6 +192,7 @@ impl ClipFolder {
             moments: clip.moments.into_iter().map(moment).collect(),
             incomplete: clip.incomplete,
             is_recovered: clip.recovered.is_some(),
+            unreadable,
         };
         facts.shorten();
         Ok(facts)
@@ -194,21 +207,30 @@ impl ClipFolder {
     }
 
     fn open(&self, name: &ClipName) -> io::Result<PlainFile> {
+        #[cfg(test)]
+        if self.path(name, ".bad")?.exists() {
+            return Err(io::Error::from_raw_os_error(5));
+        }
         PlainFile::result(&self.path(name, ".mcap")?, ByteSize::new(CLIP_MAX))
     }
 
-    /// Reads the part of a clip that begins at `begin`.
+    /// Reads at most `most` bytes of a clip, which has `bytes`, from the byte `begin` on.
     ///
     /// # Errors
     ///
     /// Those of the file system, and one that [`is_gone`] accepts if the file does not have the
     /// expected length any more.
-    pub(super) fn part(&self, name: &ClipName, bytes: u64, part: u64) -> io::Result<Vec<u8>> {
+    pub(super) fn piece(
+        &self,
+        name: &ClipName,
+        bytes: u64,
+        (begin, most): (u64, u64),
+    ) -> io::Result<Vec<u8>> {
         let file = self.open(name)?;
-        let length = ClipFacts::part_length(bytes, part).filter(|_| file.length() == bytes);
-        let length = length.ok_or(io::ErrorKind::UnexpectedEof)?;
+        let length = ClipFacts::piece_length(bytes, begin).filter(|_| file.length() == bytes);
+        let length = length.ok_or(io::ErrorKind::UnexpectedEof)?.min(most);
         let mut file = file.into_file();
-        file.seek(SeekFrom::Start(part * gleaner_fleet::clips::CLIP_PART))?;
+        file.seek(SeekFrom::Start(begin))?;
         let mut content = vec![0; length as usize];
         file.read_exact(&mut content)?;
         Ok(content)
@@ -218,10 +240,15 @@ impl ClipFolder {
     ///
     /// # Errors
     ///
-    /// As for [`part`](Self::part).
+    /// As for [`piece`](Self::piece).
     pub(super) fn thumbnail(&self, name: &ClipName) -> io::Result<Vec<u8>> {
         PlainFile::result(&self.path(name, ".jpg")?, ByteSize::new(THUMBNAIL_MAX))?.read_whole()
     }
+}
+
+/// Returns the number of bytes before a position in the list.
+pub(super) fn offset(cursor: &str) -> Option<u64> {
+    ListPosition::parse(cursor).map(|position| position.offset)
 }
 
 /// Returns whether an error means that the file is not there any more, or is another one.

@@ -1,33 +1,39 @@
 //! Announces clips to the cloud, and sends those that it wants: a task for each connection.
 //!
-//! The cloud keeps the position up to which clips were announced, and the number of the next part
-//! of each file: this has no state of its own, and goes on wherever a kill has interrupted it.
-//! One file is sent at a time. Nothing here writes to the folder of clips or deletes from it.
+//! The cloud keeps the position up to which clips were announced, and the number of bytes that it
+//! has of each file: this goes on wherever a kill has interrupted it, and `tracker` only counts
+//! attempts, pauses and bytes. One file is sent at a time, in pieces that adapt to the link. A clip
+//! that cannot be read or sent keeps no other one back. Nothing here writes to the folder of clips
+//! or deletes from it.
 
 use std::convert::Infallible;
 use std::io;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Failure};
 use gleaner_fleet::clips::{ClipName, ClipOrders, ClipReport, GoneClip, WantedClip};
-use gleaner_trust::sha256;
+use gleaner_protocol::supervision::EventKind;
 use tokio::sync::{oneshot, watch};
 use tokio::time::sleep;
 
 use super::clip_list::{ClipFolder, is_gone, known_builds};
-use super::http::CloudHttp;
+use super::http::{CloudHttp, PATIENCE};
 use crate::core::Core;
+use tracker::ClipKey;
+
+mod tracker;
+
+pub(super) use tracker::ClipTracker;
 
 /// Interval of looks for new clips.
 const INTERVAL: Duration = Duration::from_secs(5);
 /// Longest time between two looks at what is wanted, such as after a budget was used up.
 const ORDERS_INTERVAL: Duration = Duration::from_secs(300);
-/// Pause after a failure; it doubles up to the longest.
-const PAUSE: Duration = Duration::from_secs(2);
-const PAUSE_MAX: Duration = Duration::from_secs(300);
 /// Bytes per second that are sent, whatever the cloud wants.
 const RATE: f64 = 8e6;
+/// Time for the answer to the last piece of a file: the cloud compares all of it first.
+const COMPARING: Duration = Duration::from_secs(600);
 
 /// The task.
 pub(super) struct ClipSender {
@@ -36,7 +42,9 @@ pub(super) struct ClipSender {
     pub(super) http: CloudHttp,
     /// Number of the wanted state: with each new one, the cloud may want other clips.
     pub(super) wanted: watch::Receiver<u64>,
-    pub(super) pause: Duration,
+    pub(super) tracker: Arc<Mutex<ClipTracker>>,
+    /// The file of which something is sent now.
+    current: Option<ClipKey>,
 }
 
 impl ClipSender {
@@ -45,8 +53,9 @@ impl ClipSender {
         folder: ClipFolder,
         http: CloudHttp,
         wanted: watch::Receiver<u64>,
+        tracker: Arc<Mutex<ClipTracker>>,
     ) -> Self {
-        Self { core, folder, http, wanted, pause: PAUSE }
+        Self { core, folder, http, wanted, tracker, current: None }
     }
 
     /// Runs until it is aborted, with the end of the connection.
@@ -54,8 +63,10 @@ impl ClipSender {
         loop {
             let Err(failure) = self.serve().await;
             tracing::debug!("clips cannot be sent to the cloud now: {failure}");
-            sleep(self.pause).await;
-            self.pause = (self.pause * 2).min(PAUSE_MAX);
+            let current = self.current.take();
+            let (pause, event) = self.tracked(|it| it.fail(current, &failure));
+            self.warn(event);
+            sleep(pause).await;
         }
     }
 
@@ -67,9 +78,10 @@ impl ClipSender {
             let mut orders = self.report(&ClipReport::default()).await?;
             let until = Instant::now() + ORDERS_INTERVAL;
             loop {
-                if length != Some(self.folder.length()) {
-                    let seen = self.folder.length();
-                    match self.new_clips(orders.cursor.clone()).await? {
+                let seen = self.folder.length();
+                self.tracked(|it| it.learn(&orders, seen));
+                if length != Some(seen) {
+                    match self.new_clips(&orders).await? {
                         Some(report) => {
                             orders = self.report(&report).await?;
                             // Else the same clips would be read again, without an end.
@@ -77,12 +89,20 @@ impl ClipSender {
                                 return Err(not_stored());
                             }
                         }
-                        None => length = Some(seen),
+                        None => {
+                            self.tracked(ClipTracker::listed);
+                            length = Some(seen);
+                        }
                     }
-                } else if let Some(name) = orders.thumbnails.first() {
-                    orders = self.send_thumbnail(name).await?;
-                } else if let Some(wanted) = orders.wanted.first() {
-                    orders = self.send_part(wanted).await?;
+                } else if let Some(new) = self.clip_again(&orders).await? {
+                    orders = new;
+                } else if let Some((file, wanted)) = self.tracked(|it| it.next()) {
+                    self.begin(file.clone());
+                    orders = match wanted {
+                        None => self.send_thumbnail(&file.0).await?,
+                        Some(wanted) => self.send_piece(&wanted).await?.unwrap_or(orders),
+                    };
+                    self.current = None;
                 } else {
                     tokio::select! {
                         changed = self.wanted.changed() => {
@@ -94,8 +114,22 @@ impl ClipSender {
                         () = sleep(INTERVAL) => if Instant::now() >= until { break },
                     }
                 }
-                self.pause = PAUSE;
             }
+        }
+    }
+
+    fn tracked<T>(&self, act: impl FnOnce(&mut ClipTracker) -> T) -> T {
+        act(&mut self.tracker.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    fn begin(&mut self, file: ClipKey) {
+        self.tracked(|it| it.attempt(file.clone()));
+        self.current = Some(file);
+    }
+
+    fn warn(&self, event: Option<String>) {
+        if let Some(text) = event {
+            self.core.event(EventKind::Warning, None, &text);
         }
     }
 
@@ -106,60 +140,116 @@ impl ClipSender {
     async fn send_thumbnail(&self, name: &ClipName) -> Result<ClipOrders, Failure> {
         let path = format!("/v1/clips/{name}/thumbnail");
         let (folder, of) = (self.folder.clone(), name.clone());
-        match self.reading(move || folder.thumbnail(&of)).await? {
-            Ok(image) => self.send(&path, image).await,
-            Err(reason) => self.report_gone(name, true, reason).await,
+        match in_background(move |_| folder.thumbnail(&of)).await {
+            Ok(image) => self.send(&path, image, PATIENCE).await,
+            // Without it, the clip is still there, and the next ones go on.
+            Err(error) if is_gone(&error) => self.report_gone(name, true, &error).await,
+            Err(error) => Err(unreadable(&error)),
         }
     }
 
-    async fn send_part(&self, wanted: &WantedClip) -> Result<ClipOrders, Failure> {
-        let WantedClip { name, bytes, part, .. } = wanted.clone();
+    /// Sends the next piece of a clip; returns no orders if the clip cannot be read.
+    async fn send_piece(&self, wanted: &WantedClip) -> Result<Option<ClipOrders>, Failure> {
+        let WantedClip { name, bytes, from, .. } = wanted.clone();
+        let Some(begin) = from else {
+            let message = "the cloud takes no pieces of clips";
+            return Err(Failure::new(Exit::Unreachable, message)
+                .with_help("upgrade the cloud first, then its vehicles"));
+        };
+        let most = self.tracked(ClipTracker::piece);
         let (folder, of) = (self.folder.clone(), name.clone());
-        match self.reading(move || folder.part(&of, bytes, part)).await? {
-            Ok(content) => {
-                let path = format!("/v1/clips/{name}/parts/{part}/{}", sha256(&content));
-                self.send(&path, content).await
+        let looked = Instant::now();
+        let read = in_background(move |_| folder.piece(&of, bytes, (begin, most))).await;
+        let content = match read {
+            Ok(content) => content,
+            Err(error) if is_gone(&error) => {
+                return self.report_gone(&name, false, &error).await.map(Some);
             }
-            Err(reason) => self.report_gone(&name, false, reason).await,
+            Err(error) => {
+                self.not_read(&name, &error.to_string(), looked.elapsed());
+                return Ok(None);
+            }
+        };
+        let is_last = begin + content.len() as u64 == bytes;
+        let path = format!("/v1/clips/{name}/from/{begin}");
+        let orders = self.send(&path, content, if is_last { COMPARING } else { PATIENCE }).await?;
+        let now = orders.wanted.iter().find(|it| it.name == name);
+        if now.is_some_and(|now| now.from <= from) {
+            let message = "the cloud has kept nothing of a piece";
+            return Err(Failure::new(Exit::Unreachable, message));
         }
+        self.tracked(|it| it.arrived(most));
+        Ok(Some(orders))
     }
 
-    async fn send(&self, path: &str, content: Vec<u8>) -> Result<ClipOrders, Failure> {
+    async fn send(
+        &self,
+        path: &str,
+        content: Vec<u8>,
+        patience: Duration,
+    ) -> Result<ClipOrders, Failure> {
         let bytes = content.len();
-        paced(bytes, self.http.put(path, content)).await
+        self.tracked(|it| it.send(bytes as u64));
+        paced(bytes, self.http.put(path, content, patience)).await
     }
 
     async fn report_gone(
         &self,
         name: &ClipName,
         is_thumbnail: bool,
-        reason: String,
+        error: &io::Error,
     ) -> Result<ClipOrders, Failure> {
-        let gone = GoneClip { name: name.clone(), is_thumbnail, reason };
+        let gone = GoneClip { name: name.clone(), is_thumbnail, reason: reason_of(error) };
         self.report(&ClipReport { gone: vec![gone], ..ClipReport::default() }).await
     }
 
-    /// Reads a file; the inner error is the reason why it is gone.
-    async fn reading(
-        &self,
-        read: impl FnOnce() -> io::Result<Vec<u8>> + Send + 'static,
-    ) -> Result<Result<Vec<u8>, String>, Failure> {
-        match in_background(move |_| read()).await {
-            Ok(content) => Ok(Ok(content)),
-            Err(error) if error.kind() == io::ErrorKind::NotFound => {
-                Ok(Err("the vehicle has deleted the file".to_owned()))
+    async fn new_clips(&self, orders: &ClipOrders) -> Result<Option<ClipReport>, Failure> {
+        let (core, folder) = (Arc::clone(&self.core), self.folder.clone());
+        let cursor = orders.cursor.clone();
+        let read = in_background(move |is_over| {
+            folder.clips(cursor.as_deref(), None, &known_builds(&core), is_over)
+        });
+        let report = read.await.map_err(|error| unreadable(&error))?;
+        for facts in report.iter().flat_map(|it| &it.clips) {
+            if let Some(cause) = &facts.unreadable {
+                self.not_read(&facts.name, cause, Duration::ZERO);
             }
-            Err(error) if is_gone(&error) => Ok(Err(error.to_string())),
-            Err(error) => Err(unreadable(&error)),
         }
+        Ok(report)
     }
 
-    async fn new_clips(&self, cursor: Option<String>) -> Result<Option<ClipReport>, Failure> {
-        let (core, folder) = (Arc::clone(&self.core), self.folder.clone());
+    /// Reads an unreadable clip again, if one is due, and announces what is new of it.
+    async fn clip_again(&mut self, orders: &ClipOrders) -> Result<Option<ClipOrders>, Failure> {
+        let Some(name) = self.tracked(ClipTracker::due) else { return Ok(None) };
+        let (core, folder, of) = (Arc::clone(&self.core), self.folder.clone(), name.clone());
+        let looked = Instant::now();
         let read = in_background(move |is_over| {
-            folder.new_clips(cursor.as_deref(), &known_builds(&core), is_over)
+            folder.clips(None, Some(&of), &known_builds(&core), is_over)
         });
-        read.await.map_err(|error| unreadable(&error))
+        let report = read.await.map_err(|error| unreadable(&error))?;
+        let cause = report.iter().flat_map(|it| &it.clips).find_map(|it| it.unreadable.as_ref());
+        let is_readable = cause.is_none();
+        if let Some(cause) = cause {
+            self.not_read(&name, cause, looked.elapsed());
+            if orders.wanted.iter().all(|it| it.name != name) {
+                return Ok(None);
+            }
+        }
+        let report = report.unwrap_or_else(|| {
+            let reason = "the list of the vehicle lacks it".to_owned();
+            let gone = vec![GoneClip { name: name.clone(), is_thumbnail: false, reason }];
+            ClipReport { gone, ..ClipReport::default() }
+        });
+        self.begin((name.clone(), false));
+        let orders = self.report(&report).await?;
+        self.current = None;
+        self.tracked(|it| it.announced(&name, is_readable));
+        Ok(Some(orders))
+    }
+
+    /// Notes that a clip cannot be read, which took so long.
+    fn not_read(&self, name: &ClipName, cause: &str, took: Duration) {
+        self.warn(self.tracked(|it| it.not_read(name, cause, took)));
     }
 }
 
@@ -178,6 +268,14 @@ async fn paced(
 
 fn not_stored() -> Failure {
     Failure::new(Exit::Unreachable, "the cloud did not store the list of clips")
+}
+
+/// Returns the reason why a file cannot be sent.
+fn reason_of(error: &io::Error) -> String {
+    match error.kind() {
+        io::ErrorKind::NotFound => "the vehicle has deleted the file".to_owned(),
+        _ => error.to_string(),
+    }
 }
 
 fn unreadable(error: &io::Error) -> Failure {

@@ -57,10 +57,10 @@ impl CollectedLines {
             || self.oldest.is_some_and(|oldest| now.duration_since(oldest) >= COLLECT_TIME)
     }
 
-    /// Returns the lines and their number, if there are some; afterwards there are none.
-    pub(super) fn take(&mut self) -> Option<(Vec<u8>, u64)> {
+    /// Returns the lines, if there are some; afterwards there are none.
+    pub(super) fn take(&mut self) -> Option<Vec<u8>> {
         let Self { lines, count, .. } = std::mem::take(self);
-        (count > 0).then_some((lines, count))
+        (count > 0).then_some(lines)
     }
 
     pub(super) fn bytes(&self) -> usize {
@@ -139,7 +139,7 @@ mod tests {
         }
         assert!(!collected.is_due(start + Duration::from_millis(9_999)));
         assert!(collected.is_due(start + COLLECT_TIME));
-        assert_eq!(collected.take(), Some((b"text\n".repeat(5), 5)));
+        assert_eq!(collected.take(), Some(b"text\n".repeat(5)));
         assert_eq!(collected.take(), None);
         // The time of those that were sent does not count for the next one.
         collected.add(&log("debug"), b"text", start + seconds(11));
@@ -176,7 +176,7 @@ mod tests {
             collected.add(&line, b"news", start);
             collected.add(&log("info"), b"after", start);
             assert!(collected.is_due(start), "{line:?}");
-            assert_eq!(collected.take().unwrap().0, b"before\nand this\nnews\nafter\n");
+            assert_eq!(collected.take().unwrap(), b"before\nand this\nnews\nafter\n");
         }
     }
 

@@ -21,6 +21,7 @@ use tokio_tungstenite::tungstenite::handshake::derive_accept_key;
 use tokio_tungstenite::tungstenite::protocol::Role;
 
 use super::http::CloudHttp;
+use super::settings::FRAGMENT_MAX;
 
 const DEADLINE: Duration = Duration::from_secs(60);
 
@@ -62,11 +63,12 @@ impl FakeCloud {
             .unwrap();
         let mut roots = RootCertStore::empty();
         roots.add(certificate).unwrap();
-        let tls = ClientConfig::builder_with_provider(provider)
+        let mut tls = ClientConfig::builder_with_provider(provider)
             .with_protocol_versions(&[&rustls::version::TLS13])
             .unwrap()
             .with_root_certificates(roots)
             .with_no_client_auth();
+        tls.max_fragment_size = FRAGMENT_MAX;
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let http = CloudHttp::new(listener.local_addr().unwrap().to_string(), Arc::new(tls));
         Self { http, identity, listener, acceptor: TlsAcceptor::from(Arc::new(server)) }
@@ -114,16 +116,22 @@ impl FakeCloud {
 impl FakeConnection {
     /// Receives a request, and returns its head and body; `None` at the end of the connection.
     pub(super) async fn request(&mut self) -> Option<String> {
+        let (head, body, is_whole) = self.request_so_far().await?;
+        is_whole.then(|| head + &String::from_utf8_lossy(&body))
+    }
+
+    /// Receives a request, as far as it comes: its head, its body, and whether that is whole.
+    pub(super) async fn request_so_far(&mut self) -> Option<(String, Vec<u8>, bool)> {
         let mut head = Vec::new();
         while !head.ends_with(b"\r\n\r\n") {
             head.push(self.0.read_u8().await.ok()?);
         }
-        let mut request = String::from_utf8(head).unwrap();
-        let length = request.lines().find_map(|line| line.strip_prefix("content-length: "));
-        let mut body = vec![0; length.map_or(0, |it| it.parse().unwrap())];
-        self.0.read_exact(&mut body).await.ok()?;
-        request.push_str(&String::from_utf8_lossy(&body));
-        Some(request)
+        let head = String::from_utf8(head).unwrap();
+        let length = head.lines().find_map(|line| line.strip_prefix("content-length: "));
+        let (length, mut body) = (length.map_or(0, |it| it.parse().unwrap()), Vec::new());
+        while body.len() < length && self.0.read_buf(&mut body).await.is_ok_and(|read| read > 0) {}
+        let is_whole = body.len() == length;
+        Some((head, body, is_whole))
     }
 
     pub(super) async fn answer(&mut self, head: &str, body: &[u8]) {

@@ -29,8 +29,8 @@ use tokio_rustls::client::TlsStream;
 /// Time to connect, and to wait for the head of an answer or for the next piece of its body.
 pub(super) const PATIENCE: Duration = Duration::from_secs(30);
 
-/// Time to send a part of a file and to get the answer: 14 kB/s.
-const SENDING: Duration = Duration::from_secs(600);
+/// Slowest rate at which a part of a file is sent, in bytes/s.
+const RATE_MIN: u64 = 14_000;
 
 /// Longest answer without a file.
 const ANSWER_MAX: u64 = 64 << 10;
@@ -59,22 +59,23 @@ impl CloudHttp {
         Self { kept: Some(Arc::default()), ..self.clone() }
     }
 
-    /// Connects.
+    /// Connects; `dialing` is the time to reach the cloud, without the handshake.
     ///
     /// # Errors
     ///
     /// A failure if the cloud cannot be reached, or its certificate is not the expected one.
-    pub(super) async fn connect(&self) -> Result<TlsStream<TcpStream>, Failure> {
+    pub(super) async fn connect(&self, dialing: Duration) -> Result<TlsStream<TcpStream>, Failure> {
         let host = self.address.rsplit_once(':').map_or(&*self.address, |(host, _)| host);
         let host = host.trim_start_matches('[').trim_end_matches(']').to_owned();
         let name = ServerName::try_from(host)
             .map_err(|error| self.unreachable("its name is invalid", &error))?;
         let connected = self.in_time("it did not accept a connection", async {
-            let stream = TcpStream::connect(&self.address).await?;
+            let stream = timeout(dialing, TcpStream::connect(&self.address)).await??;
             stream.set_nodelay(true)?;
             TlsConnector::from(Arc::clone(&self.tls)).connect(name, stream).await
         });
-        connected.await?.map_err(|error| self.unreachable("it cannot be connected to", &error))
+        let failed = |error| self.unreachable("it cannot be connected to", &without_tls(error));
+        connected.await?.map_err(failed)
     }
 
     /// Sends a request with a body of JSON, and returns the answer.
@@ -95,7 +96,7 @@ impl CloudHttp {
         self.parsed(&whole.await??)
     }
 
-    /// Sends bytes, and returns the answer.
+    /// Sends bytes, and returns the answer, which may take so long after them.
     ///
     /// # Errors
     ///
@@ -104,9 +105,11 @@ impl CloudHttp {
         &self,
         path: &str,
         body: Vec<u8>,
+        patience: Duration,
     ) -> Result<T, Failure> {
-        let sent = timeout(SENDING, async {
-            let answer = self.request(SENDING, Method::PUT, path, body).await?;
+        let time = patience + Duration::from_secs(body.len() as u64 / RATE_MIN);
+        let sent = timeout(time, async {
+            let answer = self.request(time, Method::PUT, path, body).await?;
             self.whole(answer, ANSWER_MAX).await
         });
         let whole = sent.await.map_err(|late| self.unreachable("it did not answer", &late))??;
@@ -186,7 +189,7 @@ impl CloudHttp {
         {
             return self.accepted(answer).await;
         }
-        let stream = TokioIo::new(self.connect().await?);
+        let stream = TokioIo::new(self.connect(PATIENCE).await?);
         let (sender, connection) =
             self.in_time("it did not answer", http1::handshake(stream)).await?.map_err(failed)?;
         tokio::spawn(connection);
@@ -218,6 +221,13 @@ impl CloudHttp {
     }
 
     async fn accepted(&self, answer: Response<Incoming>) -> Result<Response<Incoming>, Failure> {
+        let kind = answer.headers().get(header::CONTENT_TYPE).and_then(|kind| kind.to_str().ok());
+        // The cloud has pages at its other address only.
+        if kind.is_some_and(|kind| kind.starts_with("text/html")) {
+            let text = "text/html, not with the cloud's JSON: a portal or proxy is in between";
+            let error = io::Error::other(format!("{} and {text}", answer.status()));
+            return Err(self.unreachable("it answers with", &error));
+        }
         match answer.status().is_success() {
             true => Ok(answer),
             false => Err(self.refused(answer).await),
@@ -283,4 +293,15 @@ fn in_time(answer: Response<Incoming>) -> impl Stream<Item = Result<Bytes, io::E
         let piece = next.unwrap_or_else(|late| Some(Err(io::Error::other(late))))?;
         Some((piece, pieces))
     })
+}
+
+/// Names a portal, which answers without TLS until its user logs in.
+fn without_tls(error: io::Error) -> io::Error {
+    let inner = error.get_ref().and_then(|inner| inner.downcast_ref());
+    match inner {
+        Some(rustls::Error::InvalidMessage(_)) => {
+            io::Error::other("the answer is not TLS: a portal or proxy is in between")
+        }
+        _ => error,
+    }
 }

@@ -1,30 +1,57 @@
 //! Keeps a connection to the cloud while the vehicle is enrolled.
+//!
+//! A vehicle on a poor link uses the seconds in which it has one: after a connection over which
+//! something was acknowledged, the first attempts come within a second each. The vehicles of a
+//! fleet do not come together to a cloud that was away: each pause is a random part of one that
+//! doubles.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use gleaner_base::{Exit, Failure, visible};
+use gleaner_base::text::in_words;
+use gleaner_base::{Exit, Failure};
 use gleaner_protocol::supervision::EventKind;
 use tokio::sync::watch;
-use tokio::time::timeout;
+use tokio::time::{interval, sleep};
 
-use super::LinkState;
 use super::http::CloudHttp;
+use super::network::sources;
 use super::reconcile::{Handled, Reconciler};
 use super::session::{CloudSession, SessionEnd};
 use super::settings::{CloudSettings, tls};
+use super::{Cloud, LinkState};
 use crate::api::Api;
+use crate::spools::{self, SpoolFolders};
 
-/// Longest pause before the first further attempt; it doubles up to the maximum. Each is a random
-/// part of it, so that the vehicles of a fleet do not come together.
+/// Longest pause before each of the first attempts; then it doubles up to the maximum.
 const PAUSE: Duration = Duration::from_secs(1);
 const PAUSE_MAX: Duration = Duration::from_secs(300);
-/// Time after which a connection counts as one that stays.
-const STAYS: Duration = Duration::from_secs(30);
+/// Number of the first attempts: in their time, a link that is away for two seconds is back.
+const FIRST: u32 = 5;
+/// Longest time to reach the cloud at the first attempt; it doubles up to the usual one. The
+/// handshake may take longer: a cloud that was away has many to do.
+const DIALING: Duration = Duration::from_secs(2);
+/// Attempts that count after a connection without progress: the next one comes within 8 s, which is
+/// about as often as the cloud lets a vehicle connect for ever.
+const AFTER_LOST: u32 = FIRST + 2;
+/// Time after which another way to the network brings the next attempt forward.
+const EARLY: Duration = Duration::from_secs(10);
+/// Interval of looks for one.
+const LOOKS: Duration = Duration::from_secs(2);
+/// Interval of counts of the records that wait.
+const COUNT_INTERVAL: Duration = Duration::from_secs(2);
 /// Interval of attempts to get the next certificate.
 const RENEWAL_INTERVAL: Duration = Duration::from_secs(3600);
 /// Longest life of a connection, in s: the time to the renewal is measured again with the next one.
 const RENEWAL_MAX_S: u64 = 30 * 86_400;
+
+/// Counts an attempt, before which `most` others count at most; returns the longest pause after it.
+fn pause(attempts: &mut u32, most: u32, is_refused: bool) -> Duration {
+    let before = (*attempts).min(most).max(if is_refused { FIRST } else { 0 });
+    *attempts = before.saturating_add(1);
+    let doublings = before.saturating_sub(FIRST - 1).min(16);
+    (PAUSE * 2_u32.pow(doublings)).min(PAUSE_MAX)
+}
 
 pub(crate) struct CloudLink {
     pub(crate) api: Api,
@@ -37,25 +64,35 @@ impl CloudLink {
         let (handled, results) = watch::channel(Handled::default());
         let core = Arc::clone(&self.api.core);
         tokio::spawn(Reconciler { core, orders: received, handled, step: Arc::default() }.run());
+        let spools = SpoolFolders(self.api.layout.spool());
+        tokio::spawn(keep_counted(self.api.cloud.clone(), spools));
         let mut settings = self.api.cloud.settings.subscribe();
-        let (mut pause, mut renewed_at) = (PAUSE, None);
+        let (mut attempts, mut renewed_at) = (0, None);
         loop {
             let current = settings.borrow_and_update().clone();
             let Some(current) = current else {
                 orders.send_replace(None);
-                pause = PAUSE;
+                attempts = 0;
                 if settings.changed().await.is_err() {
                     return;
                 }
                 continue;
             };
-            let started = Instant::now();
+            let (before, mut has_progress) = (sources(), false);
             let connected = async {
                 let http = self.http(&current)?;
                 self.renew_if_due(&http, &current, &mut renewed_at).await;
                 let until = self.renewal(&current, renewed_at);
                 let (api, handled) = (&self.api, results.clone());
-                let session = CloudSession { api, http: &http, orders: &orders, handled, until };
+                let session = CloudSession {
+                    api,
+                    http: &http,
+                    orders: &orders,
+                    handled,
+                    until,
+                    dialing: DIALING * 2_u32.pow(attempts.min(4)),
+                    has_progress: &mut has_progress,
+                };
                 session.run(settings.clone()).await
             };
             let mut others = settings.clone();
@@ -64,26 +101,37 @@ impl CloudLink {
                 ended = connected => ended,
                 _ = others.changed() => Ok(SessionEnd::Changed),
             };
-            self.api.cloud.has_ended();
-            if started.elapsed() >= STAYS {
-                pause = PAUSE;
-            }
-            let wait = match ended {
+            let was_connected = self.api.cloud.has_ended();
+            let (after, is_refused) = match ended {
                 Ok(SessionEnd::Changed) => continue,
+                Err(_) if settings.has_changed().unwrap_or(false) => continue,
                 Ok(SessionEnd::Away(after, reason)) => {
                     self.api.cloud.set_state(LinkState::Connecting, Some(reason), None);
-                    after + part_of(PAUSE)
+                    (after, true)
                 }
-                Err(_) if settings.has_changed().unwrap_or(false) => continue,
                 Err(failure) => {
                     self.note(&failure);
-                    let wait = part_of(pause);
-                    pause = (pause * 2).min(PAUSE_MAX);
-                    wait
+                    (Duration::ZERO, failure.exit == Exit::Denied)
+                }
+            };
+            let most = match (has_progress, was_connected && !is_refused) {
+                (true, _) => 0,
+                (false, true) => AFTER_LOST,
+                (false, false) => u32::MAX,
+            };
+            let pause = pause(&mut attempts, most, is_refused);
+            let early = async {
+                sleep(after + EARLY).await;
+                while sources() == before {
+                    sleep(LOOKS).await;
                 }
             };
             // Another enrolment is used at once.
-            let _ = timeout(wait, settings.changed()).await;
+            tokio::select! {
+                () = sleep(after + part_of(pause)) => {}
+                () = early => {}
+                _ = settings.changed() => {}
+            }
         }
     }
 
@@ -115,8 +163,10 @@ impl CloudLink {
         let Api { core, cloud, name, .. } = &self.api;
         let renewed = cloud.renew(core, name, (http, settings)).await;
         if let Err(failure) = renewed {
-            let text =
-                format!("the certificate for the cloud is not renewed: {}", in_words(&failure));
+            let text = format!(
+                "the certificate for the cloud is not renewed: {}",
+                in_words(&failure.message, &failure.causes)
+            );
             self.api.core.event(EventKind::Warning, None, &text);
         }
     }
@@ -127,7 +177,7 @@ impl CloudLink {
             Exit::Denied => LinkState::Refused,
             _ => LinkState::Connecting,
         };
-        let reason = in_words(failure);
+        let reason = in_words(&failure.message, &failure.causes);
         if state == LinkState::Refused && self.api.cloud.lock().state != LinkState::Refused {
             self.api.core.event(EventKind::Warning, None, &reason);
         }
@@ -135,10 +185,17 @@ impl CloudLink {
     }
 }
 
-/// Returns the failed action and its causes in one line.
-fn in_words(failure: &Failure) -> String {
-    let parts = std::iter::once(&failure.message).chain(&failure.causes);
-    parts.map(|part| visible(part)).collect::<Vec<_>>().join(": ")
+/// Counts the records that wait in the spools, also while there is no connection.
+async fn keep_counted(cloud: Cloud, spools: SpoolFolders) {
+    let mut counts = interval(COUNT_INTERVAL);
+    loop {
+        counts.tick().await;
+        let spools = spools.clone();
+        let counted = tokio::task::spawn_blocking(move || spools::count(&spools)).await;
+        if let Ok(counted) = counted {
+            cloud.lock().counts = counted;
+        }
+    }
 }
 
 /// Returns a random part of a pause.
@@ -146,4 +203,20 @@ fn part_of(pause: Duration) -> Duration {
     use std::hash::{BuildHasher, Hasher, RandomState};
     let random = RandomState::new().build_hasher().finish();
     pause.mul_f64(random as f64 / u64::MAX as f64)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pauses_double_until_something_is_acknowledged_and_at_once_after_a_refusal() {
+        let mut attempts = 0;
+        let mut after = |most, is_refused| pause(&mut attempts, most, is_refused).as_secs();
+        let pauses = [(); 8].map(|()| after(u32::MAX, false));
+        assert_eq!(pauses, [1, 1, 1, 1, 1, 2, 4, 8]);
+        assert_eq!((0..9).map(|_| after(u32::MAX, false)).max(), Some(300));
+        assert_eq!([after(AFTER_LOST, false), after(AFTER_LOST, false)], [8, 8]);
+        assert_eq!([after(0, false), after(0, true), after(u32::MAX, true)], [1, 2, 4]);
+    }
 }

@@ -2,7 +2,8 @@
 //!
 //! - `settings`: address, authority, key and certificate of an enrolled vehicle.
 //! - `http`: HTTPS to the cloud. `enrolling`: gets the first certificate, and later ones.
-//! - `link`: keeps a connection, and `session` exchanges frames over one.
+//! - `link`: keeps a connection, and `session` exchanges frames over one. `network` notices another
+//!   way to the cloud.
 //! - `plan`: the steps from what runs to what the cloud wants; `reconcile` takes them.
 //!   `followed` remembers which state of the cloud that was.
 //! - `download`: fetches a file of a revision, and goes on where that was interrupted.
@@ -24,6 +25,7 @@ mod fake_cloud;
 mod followed;
 mod http;
 mod link;
+mod network;
 mod plan;
 mod reconcile;
 mod resume;
@@ -33,15 +35,19 @@ mod settings;
 mod tests;
 mod uplink;
 
+use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
-use gleaner_base::{Exit, Failure, excerpt, visible};
-use gleaner_protocol::vehicle_api::CloudStatus;
+use gleaner_base::{Exit, Failure, visible};
+use gleaner_protocol::vehicle_api::{CloudStatus, FailingStreams, StreamLoss};
 use tokio::sync::watch;
 
 use crate::durable::DurableFile;
+use crate::spools::SpoolCounts;
+use clips::ClipTracker;
 use settings::CloudSettings;
+use uplink::FailedTry;
 
 pub(crate) use link::CloudLink;
 
@@ -51,6 +57,8 @@ pub(crate) struct Cloud {
     shared: Arc<Mutex<LinkView>>,
     settings: watch::Sender<Option<CloudSettings>>,
     file: Arc<DurableFile>,
+    /// The clips on their way, across connections.
+    clips: Arc<Mutex<ClipTracker>>,
 }
 
 /// The connection, as users see it.
@@ -60,7 +68,8 @@ struct LinkView {
     help: Option<String>,
     since: Instant,
     generation: u64,
-    unsent: u64,
+    counts: SpoolCounts,
+    failing: BTreeMap<String, FailedTry>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -93,12 +102,15 @@ impl Cloud {
             help: None,
             since: Instant::now(),
             generation: 0,
-            unsent: 0,
+            // Until they are counted.
+            counts: SpoolCounts { uncounted: 1, ..SpoolCounts::default() },
+            failing: BTreeMap::new(),
         };
         let cloud = Self {
             shared: Arc::new(Mutex::new(shared)),
             settings: watch::Sender::new(settings),
             file: Arc::new(file),
+            clips: Arc::default(),
         };
         (cloud, damage)
     }
@@ -106,6 +118,7 @@ impl Cloud {
     /// Returns the state of the connection; `None` unless the vehicle is enrolled.
     pub(crate) fn status(&self) -> Option<CloudStatus> {
         let settings = self.settings.borrow().clone()?;
+        let clips = self.clips.lock().unwrap_or_else(PoisonError::into_inner).status();
         let shared = self.lock();
         Some(CloudStatus {
             address: settings.address,
@@ -114,8 +127,11 @@ impl Cloud {
             help: shared.help.clone(),
             since_s: shared.since.elapsed().as_secs_f64(),
             generation: shared.generation,
-            unsent: shared.unsent,
+            unsent: shared.counts.unsent,
+            uncounted: shared.counts.uncounted,
+            failing: shared.failing(),
             certificate_expires: settings.expires,
+            clips,
         })
     }
 
@@ -142,30 +158,22 @@ impl Cloud {
         Ok(())
     }
 
-    fn has_ended(&self) {
-        if self.lock().state == LinkState::Connected {
+    /// Notes the end of an attempt; returns whether it was connected.
+    fn has_ended(&self) -> bool {
+        let was_connected = self.lock().state == LinkState::Connected;
+        if was_connected {
             self.set_state(LinkState::Connecting, None, None);
         }
+        was_connected
     }
 
-    /// Sets the number of records that were not sent. It lacks the `unreadable` streams, which come
-    /// with the causes: the reason names them while the vehicle is connected.
-    fn set_unsent<'s>(
-        &self,
-        unsent: u64,
-        mut unreadable: impl Iterator<Item = (&'s String, &'s String)>,
-    ) {
-        let reason = unreadable.next().map(|(name, cause)| {
-            let (name, others) = (excerpt(name), unreadable.count());
-            let others = if others > 0 { format!(" (and {others} more)") } else { String::new() };
-            let cause = visible(cause);
-            format!("stream `{name}`{others} cannot be sent, and is not counted: {cause}")
-        });
-        let mut shared = self.lock();
-        shared.unsent = unsent;
-        if shared.state == LinkState::Connected {
-            shared.reason = reason;
-        }
+    /// Returns the losses of all streams.
+    pub(crate) fn records_lost(&self) -> Vec<StreamLoss> {
+        self.lock().counts.lost.clone()
+    }
+
+    fn set_failing(&self, failing: &BTreeMap<String, FailedTry>) {
+        self.lock().failing.clone_from(failing);
     }
 
     fn set_state(&self, state: LinkState, reason: Option<String>, help: Option<String>) {
@@ -178,5 +186,27 @@ impl Cloud {
 
     fn lock(&self) -> MutexGuard<'_, LinkView> {
         self.shared.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl LinkView {
+    /// Returns the streams that fail, by cause.
+    fn failing(&self) -> Vec<FailingStreams> {
+        let mut causes: BTreeMap<&str, FailingStreams> = BTreeMap::new();
+        for (name, it) in &self.failing {
+            let (since_s, tried_s) = (it.since.elapsed().as_secs_f64(), it.tried.elapsed());
+            let tried_s = tried_s.as_secs_f64();
+            let new = || FailingStreams {
+                cause: visible(&it.cause),
+                streams: 0,
+                example: visible(&format!("`{name}`: {}", it.text)),
+                since_s,
+                tried_s,
+            };
+            let of = causes.entry(&it.cause).or_insert_with(new);
+            of.streams += 1;
+            (of.since_s, of.tried_s) = (of.since_s.max(since_s), of.tried_s.min(tried_s));
+        }
+        causes.into_values().collect()
     }
 }

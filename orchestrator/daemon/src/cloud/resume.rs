@@ -1,31 +1,32 @@
 //! The place in a stream after which the cloud lacks records.
 
-use std::path::Path;
-
 use gleaner_base::hex;
 use gleaner_fleet::Cursor;
-use gleaner_spool::{BootId, SpoolError, SpoolItem, SpoolReader};
+use gleaner_spool::{BootId, SpoolError, SpoolItem, SpoolReader, SpoolStorage};
 
 /// Opens a stream after what the cloud has of it; also returns the number of its life.
 ///
 /// A stream that does not have the record that the cloud has under its number has lost records:
 /// others have their numbers, and are sent as another life. It begins after the newest record that
-/// both have, or with the oldest one if that is not certain.
-pub(super) fn resume(
-    folder: &Path,
+/// both have, or with the oldest one if that is not certain. A cloud without the stream gets all
+/// numbers, those that the spool has lost before as a gap.
+pub(super) fn resume<S: SpoolStorage>(
+    open: &dyn Fn() -> Result<S, SpoolError>,
     stream: &str,
     cursor: Option<&Cursor>,
-) -> Result<(u64, SpoolReader), SpoolError> {
-    let oldest = |life| Ok((life, SpoolReader::open(folder, stream, None)?));
-    let Some(Cursor { life, next, seq, boot, boot_ns, .. }) = cursor else { return oldest(1) };
+) -> Result<(u64, SpoolReader<S>), SpoolError> {
+    let read = |from| Ok(SpoolReader::with_storage(open()?, stream, from));
+    let Some(Cursor { life, next, seq, boot, boot_ns, .. }) = cursor else {
+        return Ok((1, read(Some(0))?));
+    };
     // Of a stream of nothing but gaps, the cloud has no record to compare, but an end.
     let last = if boot.is_empty() { next.checked_sub(1) } else { Some(*seq) };
     // Begun again after the vehicle was cut off: what the spool has lost was sent before.
     if *next == 0 {
-        return oldest(*life);
+        return Ok((*life, read(None)?));
     }
     if let Some(last) = last {
-        let mut reader = SpoolReader::open(folder, stream, Some(last))?;
+        let mut reader = read(Some(last))?;
         let is_same = match reader.next().transpose()? {
             Some(SpoolItem::Record(record)) if record.seq == last => {
                 hex(&record.boot.0) == *boot && record.time.since_boot_ns == *boot_ns
@@ -36,15 +37,15 @@ pub(super) fn resume(
         };
         // After the record, the cloud may have gaps that this disk has lost.
         let is_end = |number| {
-            let item = SpoolReader::open(folder, stream, Some(number))?.next().transpose()?;
+            let item = read(Some(number))?.next().transpose()?;
             Ok::<_, SpoolError>(matches!(item, Some(SpoolItem::Record(_) | SpoolItem::Gap(_))))
         };
         if !is_same || (*next > last.saturating_add(1) && !is_end(*next - 1)?) {
-            let from = after_common(folder, stream, boot, *boot_ns)?;
-            return Ok((life.saturating_add(1), SpoolReader::open(folder, stream, from)?));
+            let from = after_common(read(None)?, boot, *boot_ns)?;
+            return Ok((life.saturating_add(1), read(from)?));
         }
     }
-    Ok((*life, SpoolReader::open(folder, stream, Some(*next))?))
+    Ok((*life, read(Some(*next))?))
 }
 
 /// Returns the number after the newest record that is not newer than one of this boot and time.
@@ -53,9 +54,8 @@ pub(super) fn resume(
 /// `None` if the spool has no record of that boot, so that it does not show which boots are older,
 /// or if that is the current boot: then no power cut has taken the record, and the spool may be
 /// that of another machine.
-fn after_common(
-    folder: &Path,
-    stream: &str,
+fn after_common<S: SpoolStorage>(
+    reader: SpoolReader<S>,
     boot: &str,
     boot_ns: u64,
 ) -> Result<Option<u64>, SpoolError> {
@@ -63,7 +63,7 @@ fn after_common(
         return Ok(None);
     }
     let (mut after, mut has_boot) = (None, false);
-    for item in SpoolReader::open(folder, stream, None)? {
+    for item in reader {
         let SpoolItem::Record(record) = item? else { continue };
         let is_of_boot = hex(&record.boot.0) == boot;
         // The first newer one counts: events of several threads may be out of order by a little.
@@ -80,8 +80,9 @@ fn after_common(
 #[cfg(test)]
 mod tests {
     use std::num::NonZeroU8;
+    use std::path::Path;
 
-    use gleaner_spool::{BUDGET_MIN, SpoolConfig, SpoolTime, SpoolWriter};
+    use gleaner_spool::{BUDGET_MIN, SpoolConfig, SpoolFolder, SpoolTime, SpoolWriter};
 
     use super::*;
 
@@ -110,7 +111,7 @@ mod tests {
 
     /// Returns the life, and the time of the first record that is sent.
     fn resumed(folder: &Path, cursor: Option<&Cursor>) -> (u64, Option<u64>) {
-        let (life, reader) = resume(folder, "s", cursor).unwrap();
+        let (life, reader) = resume(&|| SpoolFolder::readable(folder), "s", cursor).unwrap();
         let first = reader.filter_map(Result::ok).find_map(|item| match item {
             SpoolItem::Record(record) => Some(record.time.since_boot_ns),
             _ => None,

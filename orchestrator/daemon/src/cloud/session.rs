@@ -1,6 +1,5 @@
 //! One connection to the cloud: frames in both directions, until it ends.
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::mpsc as sync_mpsc;
 use std::time::Duration;
@@ -8,7 +7,7 @@ use std::time::Duration;
 use futures_util::{SinkExt, StreamExt};
 use gleaner_base::{Exit, Failure, excerpt, hex};
 use gleaner_fleet::{
-    Body, Desired, FRAME_MAX, Frame, Hello, PROBLEMS_MAX, PROTOCOL, Ping, Pong, Reported,
+    Body, Desired, FRAME_MAX, Frame, GoAway, Hello, PROBLEMS_MAX, PROTOCOL, Ping, Pong, Reported,
     STATUS_STREAM, STREAM_NAME_MAX, WANTED_MAX, Welcome, compress,
 };
 use gleaner_spool::BootId;
@@ -31,9 +30,12 @@ use super::reconcile::{Handled, Order};
 use super::settings::CloudSettings;
 use super::uplink::{Uplink, UplinkOrder};
 use crate::api::Api;
+use crate::spools::SpoolFolders;
 
 /// Interval of looks whether the status is to be reported.
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);
+/// Time after which a connection that still receives something lasts.
+const LASTING: Duration = Duration::from_secs(30);
 /// Longest time between two reports.
 const REPORT_MAX: Duration = Duration::from_secs(60);
 /// Number of frames about records that wait for the thread that sends these. It has one batch of
@@ -51,6 +53,10 @@ pub(super) struct CloudSession<'s> {
     pub(super) handled: watch::Receiver<Handled>,
     /// Time at which it ends, as the certificate is to be renewed.
     pub(super) until: std::time::Instant,
+    /// Longest time to reach the cloud, without the handshake.
+    pub(super) dialing: Duration,
+    /// Set once the cloud has acknowledged something or wants something new, or it lasts.
+    pub(super) has_progress: &'s mut bool,
 }
 
 #[derive(Debug)]
@@ -59,6 +65,14 @@ pub(super) enum SessionEnd {
     Away(Duration, String),
     /// The enrolment was changed or ended, or the certificate is to be renewed.
     Changed,
+}
+
+impl SessionEnd {
+    fn of(away: &GoAway) -> Self {
+        // Not for ever, whatever the cloud asks for.
+        let after = Duration::from_millis(away.after_ms.min(3_600_000));
+        Self::Away(after, excerpt(&away.reason))
+    }
 }
 
 type Socket = WebSocketStream<TlsStream<TcpStream>>;
@@ -72,33 +86,35 @@ impl CloudSession<'_> {
         let mut socket = self.open().await?;
         let authority = settings.borrow().as_ref().map(CloudSettings::authority_digest);
         let authority = authority.unwrap_or_default();
-        let Welcome { ping_s, cursors, .. } = self.welcome(&mut socket, &authority).await?;
+        let Welcome { ping_s, cursors, .. } = match self.first(&mut socket, &authority).await? {
+            Some(Body::Welcome(welcome)) => welcome,
+            Some(Body::GoAway(away)) => return Ok(SessionEnd::of(&away)),
+            _ => return Err(self.lost("it did not begin with `Welcome`")),
+        };
         self.api.cloud.set_state(LinkState::Connected, None, None);
         let (out, mut outgoing) = mpsc::channel(4);
         let (uplink_orders, received_orders) = sync_mpsc::sync_channel(UPLINK_ORDERS);
         let cursors = cursors.into_iter().map(|cursor| (cursor.stream.clone(), cursor));
-        let uplink = Uplink {
-            spool: self.api.layout.spool(),
-            cloud: self.api.cloud.clone(),
-            cursors: cursors.collect::<BTreeMap<_, _>>(),
-            out,
-            orders: received_orders,
-        };
-        tokio::task::spawn_blocking(move || uplink.run());
+        let (spools, cloud) = (SpoolFolders(self.api.layout.spool()), self.api.cloud.clone());
+        let uplink = Uplink::new(spools, cloud, cursors.collect(), out);
+        tokio::task::spawn_blocking(move || uplink.run(&received_orders));
         let (generation, wanted) = watch::channel(0);
         let (core, clips) = (Arc::clone(&self.api.core), ClipFolder(self.api.layout.clips()));
         // It ends with the connection, which drops the set.
         let mut tasks = JoinSet::new();
-        tasks.spawn(ClipSender::new(core, clips, self.http.clone(), wanted).run());
+        let tracker = Arc::clone(&self.api.cloud.clips);
+        tasks.spawn(ClipSender::new(core, clips, self.http.clone(), wanted, tracker).run());
         let ping = Duration::from_secs((*PING_S.start()).max(ping_s.min(*PING_S.end())).into());
         let (mut pings, mut looks) = (interval(ping), interval(STATUS_INTERVAL));
-        let mut last_heard = Instant::now();
+        let began = Instant::now();
+        let mut last_heard = began;
         let (mut reported, mut report_at) = (String::new(), Instant::now());
         let mut lease = TailLease::default();
         loop {
             tokio::select! {
                 message = socket.next() => {
                     last_heard = Instant::now();
+                    *self.has_progress |= last_heard > began + LASTING;
                     match self.frame(message)? {
                         None => {}
                         Some(Body::Desired(desired)) => {
@@ -107,6 +123,7 @@ impl CloudSession<'_> {
                             generation.send_replace(number);
                         }
                         Some(Body::Ack(ack)) if ack.stream.len() <= STREAM_NAME_MAX => {
+                            *self.has_progress = true;
                             self.order(&uplink_orders, UplinkOrder::Ack(ack))?;
                         }
                         Some(Body::Tail(tail)) => {
@@ -117,11 +134,7 @@ impl CloudSession<'_> {
                         Some(Body::Ping(Ping { number })) => {
                             self.send(&mut socket, Body::Pong(Pong { number })).await?;
                         }
-                        Some(Body::GoAway(away)) => {
-                            // Not for ever, whatever the cloud asks for.
-                            let after = Duration::from_millis(away.after_ms.min(3_600_000));
-                            return Ok(SessionEnd::Away(after, excerpt(&away.reason)));
-                        }
+                        Some(Body::GoAway(away)) => return Ok(SessionEnd::of(&away)),
                         Some(_) => {}
                     }
                 }
@@ -152,7 +165,7 @@ impl CloudSession<'_> {
     }
 
     /// Hands a wanted state to the reconciler.
-    fn follow(&self, desired: Desired, authority: &str) -> Result<(), Failure> {
+    fn follow(&mut self, desired: Desired, authority: &str) -> Result<(), Failure> {
         // A number above this would lock the vehicle out of every cloud that it names later.
         if desired.generation > GENERATION_MAX {
             return Err(self.lost("the number of its wanted state is above 2^60"));
@@ -160,6 +173,8 @@ impl CloudSession<'_> {
         if desired.deployments.len() > WANTED_MAX {
             return Err(self.lost(&format!("it wants more than {WANTED_MAX} deployments")));
         }
+        let is_new = |before: &Order| before.desired.generation < desired.generation;
+        *self.has_progress |= self.orders.borrow().as_ref().is_none_or(is_new);
         let (http, authority) = (self.http.clone(), authority.to_owned());
         self.orders.send_replace(Some(Order { desired, http, authority }));
         Ok(())
@@ -180,7 +195,7 @@ impl CloudSession<'_> {
     }
 
     async fn open(&self) -> Result<Socket, Failure> {
-        let stream = self.http.connect().await?;
+        let stream = self.http.connect(self.dialing).await?;
         let request = format!("wss://{}/v1/link", self.http.address);
         let request = request.into_client_request().map_err(|error| self.broken(&error))?;
         let config = WebSocketConfig::default()
@@ -202,7 +217,8 @@ impl CloudSession<'_> {
         })
     }
 
-    async fn welcome(&self, socket: &mut Socket, authority: &str) -> Result<Welcome, Failure> {
+    /// Returns the answer to the first frame.
+    async fn first(&self, socket: &mut Socket, authority: &str) -> Result<Option<Body>, Failure> {
         let hello = Hello {
             protocol: PROTOCOL,
             version: gleaner_base::version().to_owned(),
@@ -212,11 +228,7 @@ impl CloudSession<'_> {
         };
         self.send(socket, Body::Hello(hello)).await?;
         let first = timeout(PATIENCE, socket.next()).await.map_err(|late| self.broken(&late))?;
-        match self.frame(first)? {
-            Some(Body::Welcome(welcome)) => Ok(welcome),
-            Some(Body::GoAway(away)) => Err(self.lost(&away.reason)),
-            _ => Err(self.lost("it did not begin with `Welcome`")),
-        }
+        self.frame(first)
     }
 
     /// Returns the content of a received frame; `None` of one that is of a later version.

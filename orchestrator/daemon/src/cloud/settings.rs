@@ -13,6 +13,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::core::Core;
 
+/// Longest record of TLS: a connection that breaks loses the one that is on its way.
+pub(super) const FRAGMENT_MAX: Option<usize> = Some(4 << 10);
+
 /// The enrolment. It has the key of the vehicle at the cloud, which signs nothing else.
 #[derive(Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -84,7 +87,7 @@ pub(super) fn tls(
         .with_protocol_versions(&[&rustls::version::TLS13])
         .map_err(|error| unusable("settings of TLS")(&error))?
         .with_root_certificates(roots);
-    let config = match identity {
+    let mut config = match identity {
         None => builder.with_no_client_auth(),
         Some((certificate, key)) => {
             let bad = unusable("certificate of this vehicle");
@@ -94,5 +97,6 @@ pub(super) fn tls(
             builder.with_client_auth_cert(chain, key).map_err(|error| bad(&error))?
         }
     };
+    config.max_fragment_size = FRAGMENT_MAX;
     Ok(Arc::new(config))
 }

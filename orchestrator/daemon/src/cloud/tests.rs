@@ -26,6 +26,7 @@ use super::reconcile::{Handled, Order, Reconciler};
 use super::session::{CloudSession, SessionEnd};
 use super::*;
 use crate::api::Api;
+use crate::spools::{self, SpoolFolders};
 
 const DAY: u64 = 86_400;
 const ROOT: u8 = 1;
@@ -81,7 +82,9 @@ impl LinkedVehicle {
         let settings = self.settings.subscribe();
         let session = tokio::spawn(async move {
             let until = Instant::now() + Duration::from_secs(DAY);
-            let session = CloudSession { api: &api, http: &http, orders: &orders, handled, until };
+            let (has_progress, dialing) = (&mut false, Duration::from_secs(60));
+            let (api, http, orders) = (&api, &http, &orders);
+            let session = CloudSession { api, http, orders, handled, until, dialing, has_progress };
             session.run(settings).await
         });
         (session, soon(self.channels.recv()).await.unwrap())
@@ -362,7 +365,6 @@ async fn frames_that_break_the_rules_end_a_connection_with_the_reason() {
     let cases = [
         (vec![frame(Body::Desired(Desired::default()))], "it did not begin with `Welcome`"),
         (vec![Message::text("hello")], "it did not begin with `Welcome`"),
-        (vec![away(5)], "away"),
         (vec![Message::Binary(vec![0x0a, 0xff].into())], "a frame cannot be decoded"),
         (vec![welcome(), Message::Binary(vec![0xff; 100].into())], "a frame cannot be decoded"),
         (vec![welcome(), Message::Binary(vec![0; FRAME_MAX + 1].into())], "too long"),
@@ -386,11 +388,16 @@ async fn frames_that_break_the_rules_end_a_connection_with_the_reason() {
         assert!(text.contains(expected) && text.len() < 500, "{expected}: {text}");
         assert!(!text.contains('\u{1b}') && vehicle.orders.borrow().is_none(), "{text}");
     }
-    let (session, mut channel) = vehicle.connect(Welcome::default()).await;
-    channel.send_message(away(u64::MAX)).await;
-    let Ok(SessionEnd::Away(after, reason)) = soon(session).await.unwrap() else { panic!() };
-    assert_eq!(after, Duration::from_secs(3600));
-    assert!(reason.starts_with("away") && reason.len() < 500, "{reason}");
+    // Also in the place of the first frame.
+    for first in [None, Some(welcome())] {
+        let (session, mut channel) = vehicle.open().await;
+        for message in first.into_iter().chain([away(u64::MAX)]) {
+            channel.send_message(message).await;
+        }
+        let Ok(SessionEnd::Away(after, reason)) = soon(session).await.unwrap() else { panic!() };
+        assert_eq!(after, Duration::from_secs(3600));
+        assert!(reason.starts_with("away") && reason.len() < 500, "{reason}");
+    }
 }
 
 #[tokio::test]
@@ -455,7 +462,8 @@ async fn absurd_positions_and_endless_frames_change_nothing() {
     channel.send(Body::Ping(Ping { number: 9999 })).await;
     channel.until(|body| (body == Body::Pong(Pong { number: 9999 })).then_some(())).await;
     assert_eq!(vehicle.api.cloud.lock().state, LinkState::Connected);
-    assert!(vehicle.api.cloud.lock().unsent > 0, "nothing was acknowledged");
+    let spools = SpoolFolders(vehicle.api.layout.spool());
+    assert!(spools::count(&spools).unsent > 0, "nothing was acknowledged");
     // It fills no log with them.
     vehicle.api.core.event(EventKind::Warning, None, "the end");
     vehicle.events("the end").await;

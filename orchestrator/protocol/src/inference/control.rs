@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use super::INFERENCE;
+use super::{INFERENCE, TryLoad};
 use crate::link::frame::{self, tag};
 use crate::link::{
     FrameReceiver, Incoming, LinkError, ReceivedFrame, STARTER, send_frame, send_json,
@@ -57,15 +57,32 @@ pub struct GrantedModel {
     pub providers: Vec<String>,
     /// Threads of one run; `None` for 1.
     pub threads: Option<u32>,
-    /// The reason why it must not be loaded: it has ended the process several times.
+    /// The reason why the lambda must not use it: it has ended the process several times.
     pub refused: Option<String>,
 }
 
+impl GrantedModel {
+    /// Returns its load, which lambdas share that grant the same.
+    pub fn load(&self) -> TryLoad {
+        /// Largest number of threads of one run.
+        const MAX_THREADS: u32 = 64;
+        TryLoad {
+            sha256: self.sha256.clone(),
+            providers: self.providers.clone(),
+            threads: self.threads.unwrap_or(1).clamp(1, MAX_THREADS),
+        }
+    }
+}
+
 /// A lambda's process, which comes as the descriptor of its connection.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct AddClient {
+    /// Identity of the lambda, also over its restarts: it is beyond its demand under it.
+    pub id: String,
     /// Name of the lambda, for messages.
     pub name: String,
+    /// The time of models in a wake that it has stated, in ns.
+    pub demand: Option<u64>,
     /// Its memory, in bytes: the largest size of its inputs, and of its outputs.
     pub memory: u64,
     /// The models that it may use.
@@ -79,6 +96,8 @@ pub enum InferenceRequest {
     Model(ModelFile, OwnedFd, Option<OwnedFd>),
     /// A lambda.
     Client(AddClient, OwnedFd),
+    /// A load that it has requested a trial of, and the reason why it must not happen, if any.
+    Tried(TryLoad, Option<String>),
     /// Exit.
     Stop,
 }
@@ -124,6 +143,15 @@ impl InferenceControl {
     /// Those of [`add_model`](Self::add_model).
     pub fn add_client(&self, client: &AddClient, socket: BorrowedFd<'_>) -> Result<(), LinkError> {
         send_json(&self.socket, tag::ADD_CLIENT, client, &[socket], INFERENCE)
+    }
+
+    /// Sends the result of a trial: the reason why the load must not happen, if there is one.
+    ///
+    /// # Errors
+    ///
+    /// Those of [`add_model`](Self::add_model).
+    pub fn tried(&self, load: &TryLoad, refused: Option<&str>) -> Result<(), LinkError> {
+        send_json(&self.socket, tag::TRIED_LOAD, &(load, refused), &[], INFERENCE)
     }
 
     /// Requests the process to exit.
@@ -178,6 +206,10 @@ fn request(mut frame: ReceivedFrame) -> Result<InferenceRequest, LinkError> {
             Ok(InferenceRequest::Model(model, frame.descriptor()?, engine))
         }
         tag::ADD_CLIENT => Ok(InferenceRequest::Client(frame.json(STARTER)?, frame.descriptor()?)),
+        tag::TRIED_LOAD => {
+            let (load, refused) = frame.json(STARTER)?;
+            Ok(InferenceRequest::Tried(load, refused))
+        }
         tag::STOP => Ok(InferenceRequest::Stop),
         tag => Err(LinkError::Unknown { peer: STARTER, tag }),
     }

@@ -29,7 +29,10 @@ pub use control::{
     AddClient, GrantedModel, InferenceControl, InferenceRequest, InferenceServer, ModelEngine,
     ModelFile, engine_file,
 };
-pub use report::{InferenceReport, InferenceStatus, LoadedModel, ModelState};
+pub use report::{
+    InferenceReport, InferenceStatus, LoadedModel, MODEL_WORKERS, ModelState, NOTE_BYTES, TryLoad,
+    models_in_use,
+};
 pub use server::{ModelSocket, report_state};
 pub use tensor::{
     Element, MAX_DIMENSIONS, MAX_TENSOR_BYTES, TENSOR_ALIGNMENT, TensorInfo, TensorPlace,

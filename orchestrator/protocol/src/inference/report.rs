@@ -1,5 +1,8 @@
 //! Reports of `gleaner-inference` to its starter: lines of JSON on its standard output.
 
+use std::fs::File;
+use std::os::unix::fs::FileExt;
+
 use serde::{Deserialize, Serialize};
 
 /// A report.
@@ -8,12 +11,25 @@ use serde::{Deserialize, Serialize};
 pub enum InferenceReport {
     /// It accepts lambdas.
     Ready,
+    /// It is about to load a model, and requests a trial in another process first.
+    Try(TryLoad),
     /// A model was loaded, or could not be.
     Model(LoadedModel),
-    /// Its status; sent each second in which something changed.
+    /// Its status; sent each second in which something changed, and every 5 s.
     Status(InferenceStatus),
     /// Its final status.
     Ended(InferenceStatus),
+}
+
+/// A load: the digest and the options of a model.
+#[derive(Debug, Clone, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub struct TryLoad {
+    /// SHA-256 of the file.
+    pub sha256: String,
+    /// Execution providers in order of preference; empty for any.
+    pub providers: Vec<String>,
+    /// Threads of one run.
+    pub threads: u32,
 }
 
 /// A model that is loaded once for all lambdas that name it with the same options.
@@ -73,4 +89,21 @@ pub struct InferenceStatus {
     pub waiting: u64,
     /// Memory of the process, in bytes.
     pub resident_bytes: u64,
+}
+
+/// Threads that run models: one for those within their demand, the others for those that may have
+/// exceeded it at a time, none of which may make others wait.
+pub const MODEL_WORKERS: usize = 16;
+
+/// Length of a note of a model in use: the digits of its SHA-256, and, while it runs, a space and
+/// the identity of the lambda. The first note is that of the load; one for each thread follows.
+pub const NOTE_BYTES: usize = 160;
+
+/// Reads the notes of a process that has ended.
+pub fn models_in_use(file: &File) -> Vec<String> {
+    let mut notes = [0; (1 + MODEL_WORKERS) * NOTE_BYTES];
+    let read = file.read_at(&mut notes, 0).unwrap_or(0);
+    let notes = notes[..read].chunks(NOTE_BYTES).map(String::from_utf8_lossy);
+    let notes = notes.map(|note| note.trim_end_matches('\0').to_owned());
+    notes.filter(|note| !note.is_empty()).collect()
 }

@@ -1,5 +1,7 @@
 //! Messages between the ingress and one reader, and reports to the starter.
 
+use std::net::Ipv4Addr;
+
 use serde::{Deserialize, Serialize};
 
 use super::{Health, HoldGrant, ReceptionStatus};
@@ -121,6 +123,8 @@ pub struct SourceStatus {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "ingress", rename_all = "snake_case")]
 pub enum IngressReport {
+    /// It has joined the network, as this participant. Before `Ready`.
+    Joined(JoinedParticipant),
     /// It has joined the network, or opened the drive.
     Ready,
     /// Its status, once a second.
@@ -134,6 +138,17 @@ pub enum IngressReport {
         /// Each topic once.
         topics: Vec<TopicInfo>,
     },
+}
+
+/// A DDS participant, and where it announces itself: enough to announce its end.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct JoinedParticipant {
+    /// Prefix of its GUIDs.
+    pub prefix: [u8; 12],
+    /// Port of the multicast group for discovery, which depends on the domain.
+    pub port: u16,
+    /// Addresses of its interfaces with multicast.
+    pub addresses: Vec<Ipv4Addr>,
 }
 
 /// A topic of the network.

@@ -50,6 +50,8 @@ tags! {
     ADD_CLIENT = 8, "add client";
     /// Starter to recorder: as `STOP`, while the lambdas run on, with another recorder.
     GIVE_WAY = 9, "give way";
+    /// Starter to gleaner-inference: the result of a trial, as JSON.
+    TRIED_LOAD = 10, "tried load";
     /// Lambda to recorder: the header of its journal, as JSON. Sent once, first.
     HELLO = 16, "hello";
     /// Lambda to recorder: `i64` time of the decision, `u32` number of missing wakes before it, and

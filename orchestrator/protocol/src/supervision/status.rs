@@ -55,6 +55,9 @@ pub struct SupervisorStatus {
     pub recorder: Option<ProcessStatus<RecorderStatus>>,
     /// The process that runs models; absent while no lambda has any.
     pub inference: Option<ProcessStatus<InferenceStatus>>,
+    /// Models that are refused for the rest of the run: each with its cause and the way out.
+    #[serde(default)]
+    pub refused_models: Vec<String>,
     /// Number of clips since the start of the supervisor.
     pub clips: u64,
     /// Those with windows of a lambda, by its name. A clip with windows of several counts for each.

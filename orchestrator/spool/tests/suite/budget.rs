@@ -1,13 +1,15 @@
 //! Streams stay within their budget and their queue, and mark what they lose.
 
+use std::io::ErrorKind;
+
 use gleaner_base::ByteSize;
 use gleaner_spool::{
-    BUDGET_MIN, GapReason, SpoolError, SpoolFolder, SpoolGap, SpoolItem, SpoolReader, SpoolStorage,
-    SpoolWriter,
+    BUDGET_MIN, GapReason, SpoolError, SpoolFolder, SpoolGap, SpoolItem, SpoolNote, SpoolReader,
+    SpoolStorage, SpoolWriter,
 };
 
 use crate::model::{KIND, STREAM, TIME, config, items, records};
-use crate::simulated::{SimulatedDisk, SpoolRandom};
+use crate::simulated::{DiskFault, SimulatedDisk, SpoolRandom};
 
 fn writer(disk: &SimulatedDisk) -> SpoolWriter<SimulatedDisk> {
     SpoolWriter::with_storage(disk.clone(), config(BUDGET_MIN)).unwrap()
@@ -36,8 +38,8 @@ fn the_oldest_segments_are_removed_and_marked() {
     assert_eq!(status.removed, oldest);
     let newest = gaps(&disk).into_iter().rfind(|gap| gap.reason == GapReason::Budget).unwrap();
     assert_eq!(newest.to, oldest - 1);
-    let missing = SpoolGap { from: 0, to: oldest - 1, reason: GapReason::Missing, record: None };
-    assert_eq!(gaps(&disk)[0], missing);
+    let removed = SpoolGap { from: 0, to: oldest - 1, reason: GapReason::Budget, record: None };
+    assert_eq!(gaps(&disk)[0], removed);
     let first = SpoolReader::with_storage(disk, STREAM, None).next().unwrap().unwrap();
     assert!(matches!(first, SpoolItem::Record(record) if record.seq == oldest));
 }
@@ -109,6 +111,49 @@ fn a_full_queue_refuses_records_and_marks_them() {
     assert_eq!(gaps(&disk), [SpoolGap { from, to, reason: GapReason::QueueFull, record }]);
     assert_eq!(records(&items(disk)).len() as u64, 101 - refused);
     assert_eq!(writer.status().refused, refused);
+}
+
+#[test]
+fn what_a_full_disk_refused_is_a_gap_and_counted_after_kills() {
+    let disk = SimulatedDisk::new(1);
+    let mut killed = writer(&disk);
+    for _ in 0..3 {
+        killed.append(KIND, TIME, b"kept").unwrap();
+    }
+    killed.commit().unwrap();
+    let from = disk.operations();
+    disk.set_fault(Some(DiskFault { from, count: u64::MAX / 2, kind: ErrorKind::StorageFull }));
+    let refused = (0..100).filter(|_| {
+        let refused = killed.append(KIND, TIME, &[7; 100]).is_err();
+        killed.commit().unwrap_err();
+        refused
+    });
+    // The queue has 4 KiB, and a record 140 bytes.
+    assert_eq!(refused.count(), 100 - 29);
+    // Also one that ends before it could write the gap.
+    drop(killed);
+    drop(writer(&disk));
+    disk.set_fault(None);
+    let mut writer = writer(&disk);
+    writer.append(KIND, TIME, b"new").unwrap();
+    writer.commit().unwrap();
+    let found = items(disk.clone());
+    assert_eq!(records(&found).last_key_value().unwrap().1, b"new");
+    let full = gaps(&disk).into_iter().find(|gap| gap.reason == GapReason::DiskFull).unwrap();
+    assert!(full.from < 10 && full.to >= 102, "{full:?}");
+    let note = disk.noted().unwrap().unwrap();
+    let lost = full.to - full.from + 1;
+    assert_eq!((note.lost, note.pending, note.reason), (lost, 0, Some(GapReason::DiskFull)));
+    assert!(!note.is_failing && note.durable == writer.status().next);
+}
+
+#[test]
+fn a_note_about_numbers_that_the_disk_has_lost_hides_none_that_use_them_again() {
+    let disk = SimulatedDisk::new(1);
+    let lost = SpoolNote { durable: 9, next: 9, removed: 8, ..SpoolNote::default() };
+    disk.note(&lost).unwrap();
+    drop(writer(&disk));
+    assert_eq!(disk.noted().unwrap(), Some(SpoolNote::default()));
 }
 
 #[test]

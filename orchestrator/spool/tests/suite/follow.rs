@@ -129,7 +129,7 @@ fn a_reader_beside_a_writer_returns_each_record_unless_the_budget_removed_it() {
                         record.seq + 1
                     }
                     SpoolItem::Gap(gap) if gap.record.is_none() => {
-                        assert_eq!((gap.from, gap.reason), (expected, GapReason::Missing));
+                        assert_eq!((gap.from, gap.reason), (expected, GapReason::Budget));
                         let oldest = oldest(scratch.path());
                         assert!(gap.to < oldest, "{gap:?}, but segment {oldest} is there");
                         gap.to + 1

@@ -6,7 +6,7 @@ use std::io;
 use std::ops::Range;
 use std::rc::Rc;
 
-use gleaner_spool::{SegmentFile, SpoolStorage};
+use gleaner_spool::{SegmentFile, SpoolNote, SpoolStorage};
 
 /// Pseudo-random numbers, the same in each run (SplitMix64).
 #[derive(Default)]
@@ -53,6 +53,7 @@ struct Disk {
     operations: u64,
     lists: u64,
     released: u64,
+    note: Option<SpoolNote>,
     fault: Option<DiskFault>,
     /// Segment, and range of its bytes, whose reads fail with `EIO`.
     unreadable: Option<(u64, Range<u64>)>,
@@ -135,6 +136,9 @@ impl SimulatedDisk {
             inode.durable = inode.content.clone();
         }
         (disk.durable_names, disk.names) = (names.clone(), names);
+        if disk.random.below(2) == 0 {
+            disk.note = None;
+        }
     }
 
     /// Counts an operation, and fails if it is its turn.
@@ -200,17 +204,32 @@ impl SpoolStorage for SimulatedDisk {
     }
 
     fn release(&self, before: u64) -> io::Result<()> {
+        self.operation(false)?;
         self.0.borrow_mut().released = before;
+        Ok(())
+    }
+
+    fn noted(&self) -> io::Result<Option<SpoolNote>> {
+        self.operation(false)?;
+        Ok(self.0.borrow().note)
+    }
+
+    /// In place: it needs no space.
+    fn note(&self, note: &SpoolNote) -> io::Result<()> {
+        self.operation(false)?;
+        self.0.borrow_mut().note = Some(*note);
         Ok(())
     }
 }
 
 impl SegmentFile for SimulatedFile {
     fn length(&self) -> io::Result<u64> {
+        self.disk.operation(false)?;
         Ok(self.disk.0.borrow().inodes[self.inode].content.len() as u64)
     }
 
     fn is_linked(&self) -> io::Result<bool> {
+        self.disk.operation(false)?;
         Ok(self.disk.0.borrow().names.values().any(|inode| *inode == self.inode))
     }
 

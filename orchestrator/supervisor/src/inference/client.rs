@@ -73,7 +73,7 @@ mod tests {
     #[test]
     fn a_lambda_that_does_not_read_keeps_its_connection_and_reads_the_last_state_at_the_end() {
         let (lambda, socket) = ModelClient::pair().unwrap();
-        let add = AddClient { name: "busy".to_owned(), memory: 0, models: Vec::new() };
+        let add = AddClient { name: "busy".to_owned(), ..AddClient::default() };
         let mut client = Client::new(add, socket);
         while !client.has_unsent() {
             assert!(client.report(ProcessState::Ended("it has ended".to_owned())));

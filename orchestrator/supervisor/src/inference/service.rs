@@ -1,53 +1,50 @@
 //! Starts the process, connects lambdas to it, and starts it again after it has ended.
 //!
-//! The socket of a lambda outlives the process: the next one uses the same. A model that was
-//! loading or running at several ends of the process is not loaded again.
+//! The socket of a lambda outlives the process: the next one uses the same. A model that ended
+//! several processes is not used again.
 
 use std::collections::BTreeMap;
+use std::ffi::OsString;
 use std::fs::File;
 use std::io::{BufReader, Read};
 use std::os::fd::{AsFd, OwnedFd};
-use std::os::unix::fs::FileExt;
 use std::os::unix::net::UnixStream;
 use std::os::unix::process::CommandExt;
-use std::path::{Path, PathBuf};
-use std::process::{Child, Command, ExitStatus, Stdio};
-use std::sync::atomic::AtomicBool;
+use std::path::PathBuf;
+use std::process::{Command, ExitStatus, Stdio};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use gleaner_base::{Exit, Failure, PlainFile, chain};
-use gleaner_lambda::layout::FILE_MAX;
-use gleaner_lambda::manifest::{Manifest, ModelSpec};
+use gleaner_base::{Exit, Failure, chain};
+use gleaner_lambda::manifest::Manifest;
 use gleaner_lambda::{BuildDir, InferenceLimits};
 use gleaner_parts::Parts;
 use gleaner_protocol::inference::{
-    AddClient, GrantedModel, InferenceControl, ModelClient, ModelEngine, ModelFile,
+    AddClient, InferenceControl, InferenceReport, ModelClient, TryLoad, models_in_use,
 };
 use gleaner_protocol::link::LinkError;
 use gleaner_protocol::{Handover, SHUTDOWN_TIMEOUT};
 use rustix::fs::{MemfdFlags, memfd_create};
 
+use super::blame::Blame;
 use super::client::{Client, ProcessState};
-use super::engine;
+use super::passed_model::{PassedModel, granted};
+use super::process::{Process, START, STEP};
 use super::totals::ModelTotals;
-use super::{INFERENCE, InferenceEvent};
+use super::trial::LoadTrial;
+use super::{INFERENCE, InferenceEvent, InferenceUse};
 use crate::lines::{next_report, pass_on};
 use crate::process::ended;
-use crate::restart_delay::{ServiceDelays, was_killed};
-
-/// Number of ends of the process that a model may cause before it is refused.
-const ENDS_MAX: u32 = 3;
-
-/// Length of a digest in the file of running models: one of the model that loads, then one of the
-/// model that runs.
-const DIGEST: usize = 64;
-
-/// Time after which a process was healthy: earlier ends do not count any more.
-const HEALTHY: Duration = Duration::from_secs(60);
+use crate::restart_delay::{SILENCE, ServiceDelays, was_killed};
 
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
+/// Time after which a load is tried again that could not be tried.
+const TRY_AGAIN: Duration = Duration::from_secs(5);
+
+/// The reason why a load must not happen, and the end of that if it could not be tried.
+type TrialResult = (Option<String>, Option<Instant>);
 
 type Events = Arc<dyn Fn(InferenceEvent) + Send + Sync>;
 
@@ -70,22 +67,14 @@ struct ServiceState {
     control: Option<InferenceControl>,
     models: Vec<PassedModel>,
     clients: Vec<Client>,
-    /// Number of ends of the process at which a model was loading or running, by its digest.
-    ends: BTreeMap<String, u32>,
+    blame: Blame,
+    /// `None` while a trial is in progress.
+    trials: BTreeMap<TryLoad, Option<TrialResult>>,
     stops: bool,
 }
 
-/// A model that the process may load.
-struct PassedModel {
-    model: ModelFile,
-    file: File,
-    /// Entry with its engine.
-    engine: Option<File>,
-}
-
 impl InferenceService {
-    /// Starts the process with these limits. If the folder `engines` is given, it builds engines
-    /// into it.
+    /// Starts the process with these limits, for `purpose`.
     ///
     /// # Errors
     ///
@@ -93,10 +82,23 @@ impl InferenceService {
     pub fn start(
         parts: &Parts,
         limits: &InferenceLimits,
-        engines: Option<&Path>,
+        purpose: InferenceUse<'_>,
         events: impl Fn(InferenceEvent) + Send + Sync + 'static,
     ) -> Result<InferenceService, Failure> {
-        let program = parts.program(INFERENCE)?;
+        let args = match purpose {
+            InferenceUse::Shared => vec!["--trials".into()],
+            InferenceUse::OneLambda => Vec::new(),
+            InferenceUse::Engines(folder) => vec!["--build-engines".into(), folder.into()],
+        };
+        Self::launch(parts.program(INFERENCE)?, *limits, args, events)
+    }
+
+    pub(super) fn launch(
+        program: PathBuf,
+        limits: InferenceLimits,
+        args: Vec<OsString>,
+        events: impl Fn(InferenceEvent) + Send + Sync + 'static,
+    ) -> Result<InferenceService, Failure> {
         let failed = |error: &dyn std::error::Error| {
             Failure::caused_by(Exit::Internal, format!("cannot start `{INFERENCE}`"), error)
         };
@@ -106,10 +108,10 @@ impl InferenceService {
         let (events, totals) = (Arc::new(events), Arc::default());
         let mut supervisor = Supervisor {
             program,
-            limits: *limits,
-            engines: engines.map(Path::to_owned),
+            limits,
+            args,
             shared: Arc::clone(&shared),
-            running,
+            running: Arc::new(running),
             events,
             totals,
         };
@@ -121,24 +123,29 @@ impl InferenceService {
         Ok(InferenceService { shared, supervisor: Some(supervisor) })
     }
 
-    /// Adds a lambda, whose build is `build`, under the name `name`; returns its end of the
-    /// connection.
+    /// Adds a lambda with this identity, whose build is `build`; returns its end of the connection.
     ///
     /// # Errors
     ///
     /// A failure if the file of a model cannot be opened.
-    pub fn add(
-        &self,
-        name: &str,
-        build: &BuildDir,
-        manifest: &Manifest,
-    ) -> Result<OwnedFd, Failure> {
+    pub fn add(&self, id: &str, build: &BuildDir, manifest: &Manifest) -> Result<OwnedFd, Failure> {
         let models = manifest.models.iter().map(|model| PassedModel::open(model, build.path()));
         let models: Vec<PassedModel> = models.collect::<Result<_, _>>()?;
+        let (id, name) = (id.to_owned(), manifest.lambda.name.to_string());
+        let demand = manifest.demand.model_time.map(|it| it.as_nanos() as u64);
+        let memory = manifest.limits.memory.bytes();
+        let granted = manifest.models.iter().map(granted).collect();
+        self.connect(AddClient { id, name, demand, memory, models: granted }, models)
+    }
+
+    pub(super) fn connect(
+        &self,
+        add: AddClient,
+        models: Vec<PassedModel>,
+    ) -> Result<OwnedFd, Failure> {
         let (lambda_end, socket) = ModelClient::pair().map_err(|error| {
             Failure::caused_by(Exit::Internal, format!("cannot connect to `{INFERENCE}`"), &error)
         })?;
-        let granted = manifest.models.iter().map(granted).collect();
         let mut state = self.shared.lock();
         for passed in models {
             if !state.models.iter().any(|known| known.model.sha256 == passed.model.sha256) {
@@ -146,8 +153,6 @@ impl InferenceService {
                 state.models.push(passed);
             }
         }
-        let memory = manifest.limits.memory.bytes();
-        let add = AddClient { name: name.to_owned(), memory, models: granted };
         let client = Client::new(add, socket);
         // Processes that have ended, such as the one before this, leave their socket here.
         state.clients.retain(|client| !client.has_ended());
@@ -217,14 +222,7 @@ impl ServiceState {
     fn pass_client(&mut self, client: &Client) {
         let mut add = client.add.clone();
         for model in &mut add.models {
-            let ends = self.ends.get(&model.sha256).copied().unwrap_or(0);
-            model.refused = (ends >= ENDS_MAX).then(|| {
-                format!(
-                    "{INFERENCE} has ended {ends} times while model `{}` was loading or running: \
-                     it is not loaded again in this run",
-                    model.name
-                )
-            });
+            model.refused = self.blame.refusal(&model.sha256, &add.id).cloned();
         }
         self.pass(|control| control.add_client(&add, client.socket.as_fd()));
     }
@@ -259,14 +257,15 @@ impl ServiceState {
 }
 
 /// The thread that starts the process and waits for its end.
+#[derive(Clone)]
 struct Supervisor {
     program: PathBuf,
     limits: InferenceLimits,
-    /// Folder in which engines are built instead of running models.
-    engines: Option<PathBuf>,
+    /// Further arguments of the process.
+    args: Vec<OsString>,
     shared: Arc<Shared>,
-    /// The file in which the process notes the digests of models that it loads and runs.
-    running: File,
+    /// The file in which the process notes the models that it loads and runs.
+    running: Arc<File>,
     events: Events,
     totals: Arc<Mutex<ModelTotals>>,
 }
@@ -279,10 +278,11 @@ impl Supervisor {
         let mut current = Ok(child);
         loop {
             let started = Instant::now();
-            let mut is_killed = false;
+            let (mut is_killed, mut is_fault) = (false, false);
             let reason = match current.and_then(|child| self.wait(child)) {
                 Ok(status) => {
                     is_killed = was_killed(status);
+                    is_fault = !is_killed;
                     ended(INFERENCE, status)
                 }
                 Err(reason) => reason,
@@ -292,20 +292,14 @@ impl Supervisor {
                 return;
             }
             state.control = None;
-            let blamed = self.blame(&mut state, is_killed);
-            let reason = match &blamed {
-                Some((_, what)) => format!("{reason}, {what}"),
-                None => reason,
-            };
+            let (reason, refusal) = self.blame(&mut state, reason, is_fault);
             let state_of_client = || ProcessState::Ended(reason.clone());
             state.clients.retain_mut(|client| client.report(state_of_client()));
-            if started.elapsed() >= HEALTHY {
-                state.ends.retain(|digest, _| blamed.as_ref().is_some_and(|it| it.0 == *digest));
-            }
             drop(state);
             let delay = delays.after(started.elapsed(), is_killed);
             // Not under the lock: the receiver may add a lambda before it reads this.
-            (self.events)(InferenceEvent::Ended(reason, delay));
+            (self.events)(InferenceEvent::Ended(reason, delay, is_fault));
+            refusal.into_iter().for_each(|text| (self.events)(InferenceEvent::Refused(text)));
             if self.shared.stops_within(delay) {
                 return;
             }
@@ -322,11 +316,13 @@ impl Supervisor {
         let running = Some(self.running.try_clone()?.into());
         Handover { control: Some(process_end), running, ..Handover::default() }.send(&handover)?;
         let InferenceLimits { memory, run_max, load_max } = self.limits;
+        let apart = self.shared.lock().blame.apart_for();
         let child = Command::new(&self.program)
             .args(["--memory".to_owned(), memory.bytes().to_string()])
             .args(["--run-max".to_owned(), run_max.as_secs_f64().to_string()])
             .args(["--load-max".to_owned(), load_max.as_secs_f64().to_string()])
-            .args(self.engines.iter().flat_map(|folder| [Path::new("--build-engines"), folder]))
+            .args(["--apart".to_owned(), apart.as_secs().to_string()])
+            .args(&self.args)
             // Wheels of ONNX Runtime since 1.29 send data to Microsoft otherwise. The call that
             // switches that off comes too late for the first event.
             .env("ORT_DISABLE_TELEMETRY", "1")
@@ -336,11 +332,12 @@ impl Supervisor {
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())
             .spawn()?;
-        let mut process = Process { child, _handover: handover, readers: Vec::new() };
+        let mut process = Process { child, handover, readers: Vec::new(), reports: Arc::default() };
         let reader = || thread::Builder::new().name("inference output".to_owned());
         if let Some(reports) = process.child.stdout.take() {
-            let (events, totals) = (Arc::clone(&self.events), Arc::clone(&self.totals));
-            process.readers.push(reader().spawn(move || follow(reports, &events, &totals))?);
+            let (count, supervisor) = (Arc::clone(&process.reports), self.clone());
+            let follow = move || supervisor.follow(reports, &count);
+            process.readers.push(reader().spawn(follow)?);
         }
         if let Some(stderr) = process.child.stderr.take() {
             let events = Arc::clone(&self.events);
@@ -358,10 +355,11 @@ impl Supervisor {
         Ok(process)
     }
 
-    /// Waits for the end of the process. It is killed if it does not end on request, or does not
-    /// read its messages.
+    /// Waits for the end of the process. It is killed if it does not end on request, does not read
+    /// its messages, or stands still.
     fn wait(&self, mut process: Process) -> Result<ExitStatus, String> {
-        let mut requested = None;
+        let (mut requested, mut is_silent) = (None, false);
+        let (mut seen, mut since, mut looked) = (0, Instant::now(), Instant::now());
         let status = loop {
             match process.child.try_wait() {
                 Ok(Some(status)) => break Ok(status),
@@ -374,7 +372,13 @@ impl Supervisor {
                 requested.get_or_insert_with(Instant::now);
             }
             let is_late = requested.is_some_and(|at: Instant| at.elapsed() > SHUTDOWN_TIMEOUT);
-            if is_late || state.control.is_none() {
+            let (count, now) = (process.reports.load(Ordering::Relaxed), Instant::now());
+            if count != seen || now.duration_since(looked) > STEP {
+                (seen, since) = (count, now);
+            }
+            looked = now;
+            is_silent |= now.duration_since(since) > if seen == 0 { START } else { SILENCE };
+            if is_late || is_silent || state.control.is_none() {
                 // It may have ended meanwhile.
                 let _ = process.child.kill();
             }
@@ -385,86 +389,107 @@ impl Supervisor {
             let _ = reader.join();
         }
         self.totals.lock().unwrap_or_else(PoisonError::into_inner).end_process();
-        status
+        if is_silent { Err(format!("{INFERENCE} stood still, and was killed")) } else { status }
     }
 
-    /// Counts the end against the model that ran, or else the one that was loading, unless the
-    /// process `is_killed`; returns its digest, and a text about it.
-    fn blame(&self, state: &mut ServiceState, is_killed: bool) -> Option<(String, String)> {
-        let mut digests = [0; 2 * DIGEST];
-        let read = self.running.read_at(&mut digests, 0).unwrap_or(0);
-        // The note counts once, even if the next process cannot be started.
-        let _ = self.running.set_len(0);
-        let notes = digests[..read].chunks(DIGEST).zip(["loaded", "ran"]);
-        notes.rev().find_map(|(digest, what)| {
-            let digest = std::str::from_utf8(digest).ok()?;
-            let known = state.models.iter().find(|known| known.model.sha256 == digest)?;
-            let text = format!("while it {what} `{}`", known.model.path);
-            *state.ends.entry(digest.to_owned()).or_default() += u32::from(!is_killed);
-            Some((digest.to_owned(), text))
-        })
-    }
-}
-
-struct Process {
-    child: Child,
-    /// Open, as its end would mean that this program has ended.
-    _handover: UnixStream,
-    readers: Vec<JoinHandle<()>>,
-}
-
-impl Drop for Process {
-    fn drop(&mut self) {
-        if let Ok(None) = self.child.try_wait() {
-            let _ = self.child.kill();
-            let _ = self.child.wait();
-        }
-    }
-}
-
-fn follow(reports: impl Read, events: &Events, totals: &Mutex<ModelTotals>) {
-    let mut reports = BufReader::new(reports);
-    let mut line = Vec::new();
-    while next_report(&mut reports, &mut line).unwrap_or(false) {
-        match serde_json::from_slice(&line) {
-            Ok(mut report) => {
-                totals.lock().unwrap_or_else(PoisonError::into_inner).add_to(&mut report);
-                events(InferenceEvent::Report(report));
-            }
-            Err(error) => {
-                let text = format!("cannot parse a report of {INFERENCE}: {error}");
-                events(InferenceEvent::Warning(text));
-            }
-        }
-    }
-}
-
-fn granted(model: &ModelSpec) -> GrantedModel {
-    GrantedModel {
-        name: model.name.to_string(),
-        sha256: model.sha256.to_string(),
-        providers: model.providers.clone(),
-        threads: u32::try_from(model.threads).ok(),
-        refused: None,
-    }
-}
-
-impl PassedModel {
-    /// Opens the file of a model in the build `build`, and its engine if there is one.
-    fn open(model: &ModelSpec, build: &Path) -> Result<Self, Failure> {
-        let file = PlainFile::inside(build, model.file.as_path(), FILE_MAX);
-        let file = file.map(PlainFile::into_file).map_err(|error| {
-            let message =
-                format!("cannot open `{}`, the file of model `{}`", model.file, model.name);
-            Failure::caused_by(Exit::Usage, message, &error)
-                .with_help("build the lambda again: gleaner build DIR")
-        })?;
-        let (sha256, path) = (model.sha256.to_string(), model.file.to_string());
-        let (engine, entry) = match engine::stored(&sha256) {
-            Ok(Some(entry)) => (ModelEngine::Attached, Some(entry)),
-            Ok(None) => (ModelEngine::None, None),
-            Err(reason) => (ModelEngine::Refused(reason), None),
+    /// Charges the end, if it `is_fault`, to the model that alone was in use. Returns the reason
+    /// with the models in use, and why one is refused from now on.
+    fn blame(
+        &self,
+        state: &mut ServiceState,
+        mut reason: String,
+        is_fault: bool,
+    ) -> (String, Option<String>) {
+        let known = |note: String| {
+            let known = state.models.iter().find(|it| note.starts_with(&it.model.sha256))?;
+            Some((note, known.model.clone()))
         };
-        Ok(Self { model: ModelFile { sha256, path, engine }, file, engine: entry })
+        let in_use: Vec<_> = models_in_use(&self.running).into_iter().filter_map(known).collect();
+        // The notes count once, even if the next process cannot be started.
+        let _ = self.running.set_len(0);
+        for (index, (note, model)) in in_use.iter().enumerate() {
+            let begin = if index == 0 { ", while it" } else { " and" };
+            let verb = if note.contains(' ') { "ran" } else { "loaded" };
+            reason += &format!("{begin} {verb} `{}`", model.path);
+        }
+        let charged = if is_fault { &in_use[..] } else { &[] };
+        let refusal = state.blame.ended(charged, &reason, Instant::now());
+        if charged.len() > 1 {
+            let seconds = state.blame.apart_for().as_secs();
+            reason += &format!(": none is charged; for {seconds} s, one runs at a time");
+        }
+        (reason, refusal)
+    }
+
+    /// Reads the reports of the process, and counts them.
+    fn follow(&self, reports: impl Read, count: &AtomicU64) {
+        let mut reports = BufReader::new(reports);
+        let mut line = Vec::new();
+        while next_report(&mut reports, &mut line).unwrap_or(false) {
+            count.fetch_add(1, Ordering::Relaxed);
+            match serde_json::from_slice(&line) {
+                Ok(InferenceReport::Try(load)) => self.try_load(load),
+                Ok(mut report) => {
+                    let mut totals = self.totals.lock().unwrap_or_else(PoisonError::into_inner);
+                    totals.add_to(&mut report);
+                    drop(totals);
+                    (self.events)(InferenceEvent::Report(report));
+                }
+                Err(error) => {
+                    let text = format!("cannot parse a report of {INFERENCE}: {error}");
+                    (self.events)(InferenceEvent::Warning(text));
+                }
+            }
+        }
+    }
+
+    /// Tries a load in a process of its own, unless the result is known, and sends the result to
+    /// the process that runs then.
+    fn try_load(&self, load: TryLoad) {
+        let mut state = self.shared.lock();
+        let known = state.models.iter().find(|known| known.model.sha256 == load.sha256);
+        let granted = state.clients.iter().find_map(|client| {
+            let model = client.add.models.iter().find(|model| model.load() == load)?;
+            Some((client.add.clone(), model.clone()))
+        });
+        let (Some(model), Some((add, granted))) = (known.cloned(), granted) else {
+            let why = Some("the model cannot be tried: its lambda has ended");
+            return state.pass(|control| control.tried(&load, why));
+        };
+        match state.trials.get(&load).cloned() {
+            Some(None) => return,
+            Some(Some((refused, until))) if until.is_none_or(|at| Instant::now() < at) => {
+                return state.pass(|control| control.tried(&load, refused.as_deref()));
+            }
+            _ => drop(state.trials.insert(load.clone(), None)),
+        }
+        drop(state);
+        let (of_thread, of_trial) = (self.clone(), load.clone());
+        let run = move || {
+            let Supervisor { program, limits, shared, .. } = of_thread.clone();
+            let add = AddClient { models: vec![granted], ..add };
+            let trial = LoadTrial { program, limits, add, model };
+            of_thread.end_trial(&of_trial, trial.run(|| shared.lock().stops));
+        };
+        if let Err(error) = thread::Builder::new().name("trial".to_owned()).spawn(run) {
+            self.end_trial(&load, Err(format!("a model cannot be tried: {error}")));
+        }
+    }
+
+    /// Sends the result of a trial to the process that runs now.
+    fn end_trial(&self, load: &TryLoad, tried: Result<Option<String>, String>) {
+        let mut state = self.shared.lock();
+        let (refused, until) = match tried.clone() {
+            Ok(refused) => (refused, None),
+            Err(reason) => (Some(reason), Some(Instant::now() + TRY_AGAIN)),
+        };
+        state.pass(|control| control.tried(load, refused.as_deref()));
+        state.trials.insert(load.clone(), Some((refused, until)));
+        drop(state);
+        match tried {
+            Ok(None) => {}
+            Ok(Some(reason)) => (self.events)(InferenceEvent::Refused(reason)),
+            Err(reason) => (self.events)(InferenceEvent::Warning(reason)),
+        }
     }
 }

@@ -18,7 +18,7 @@ impl ModelTotals {
     /// Adds the counts of earlier processes to those of a report.
     pub(super) fn add_to(&mut self, report: &mut InferenceReport) {
         match report {
-            InferenceReport::Ready => {}
+            InferenceReport::Ready | InferenceReport::Try(_) => {}
             InferenceReport::Model(model) => self.add_earlier(model),
             InferenceReport::Status(status) => {
                 status.models.iter_mut().for_each(|model| self.add_earlier(model));

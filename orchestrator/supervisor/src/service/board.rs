@@ -181,13 +181,20 @@ impl RunObserver for Board {
                     InferenceReport::Status(last) | InferenceReport::Ended(last) => {
                         inference.last = Some(Box::new(last));
                     }
-                    InferenceReport::Model(_) => {}
+                    InferenceReport::Model(_) | InferenceReport::Try(_) => {}
                 }
             }
             InferenceEvent::Stderr(piece) => self.stderr(&piece),
-            InferenceEvent::Ended(reason, delay) => {
+            InferenceEvent::Ended(reason, delay, _) => {
                 self.lock().inference.get_or_insert_default().ended(&reason);
                 self.event(EventKind::Failed, None, &failed(&reason, delay));
+            }
+            InferenceEvent::Refused(text) => {
+                self.warn(&text);
+                let refused = &mut self.lock().refused_models;
+                if !refused.contains(&text) {
+                    refused.push(text);
+                }
             }
             InferenceEvent::Warning(text) => self.warn(&text),
         }

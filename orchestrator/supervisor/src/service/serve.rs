@@ -367,6 +367,11 @@ impl WantedState<'_> {
             self.desired.lambdas.iter().position(|it| it.id == lambda.id).unwrap_or(usize::MAX)
         };
         status.lambdas.sort_by_key(place);
+        // A refusal names the beginning of the digest; another file is another model.
+        let models = || lambdas.iter().flat_map(|lambda| &lambda.lambda.manifest.models);
+        status.refused_models.retain(|refused| {
+            models().any(|model| refused.contains(&model.sha256.to_string()[..8]))
+        });
         SupervisorReport::Status(Box::new(status))
     }
 }

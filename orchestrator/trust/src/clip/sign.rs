@@ -15,7 +15,6 @@ pub const SIGNATURE: &str = "gleaner/signature.json";
 /// Media type of that attachment.
 pub const MEDIA_TYPE: &str = "application/json";
 
-/// Opcodes of MCAP.
 pub(super) const ATTACHMENT: u8 = 0x09;
 pub(super) const DATA_END: u8 = 0x0f;
 /// Length of the opcode and the length of a record.
@@ -46,7 +45,6 @@ impl ContentDigest {
         self.crc.update(bytes);
     }
 
-    /// Returns the checksum of all bytes so far.
     pub(super) fn crc(&self) -> u32 {
         self.crc.clone().finalize()
     }
@@ -124,7 +122,6 @@ impl ClipSigner {
     }
 }
 
-/// Places in a file, from the attachment on.
 struct RestPlaces {
     envelope: Range<usize>,
     /// Checksum of the attachment.
@@ -156,7 +153,6 @@ impl RestPlaces {
     }
 }
 
-/// Returns the head of the end of the data.
 pub(super) fn data_end() -> [u8; HEAD] {
     let mut head = [0; HEAD];
     (head[0], head[1]) = (DATA_END, CRC as u8);

@@ -99,7 +99,6 @@ impl TrustedVehicles {
         self.0.iter().map(|(_, key)| key)
     }
 
-    /// Returns the names of the vehicles with the key of this id.
     pub(super) fn named(&self, id: &str) -> impl Iterator<Item = &VehicleName> {
         self.0.iter().filter(move |(_, key)| key.id() == *id).map(|(name, _)| name)
     }

@@ -65,7 +65,6 @@ fn revision(release: u64) -> Revision {
     }
 }
 
-/// A deployment of the revision that was signed as `revision`.
 fn deployment(release: u64, revision: &[u8]) -> Deployment {
     let (root, floors, labels) = (root(), Floors::default(), Labels::new());
     let verifier =

@@ -8,7 +8,6 @@ use serde_json::json;
 use super::*;
 use crate::account::CloudAccount;
 
-/// SHA-256 of `content`.
 const SHA256: &str = "ed7002b439e9ac845f22357d822bac1444730fbdb6016d3ec9432297b9ec9f73";
 
 fn clip() -> FleetClip {

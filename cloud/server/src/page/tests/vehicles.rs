@@ -43,8 +43,8 @@ async fn records_of_several_streams_are_listed_by_their_times() {
     cloud.store.invite_vehicle("console", "car-1").await.unwrap();
     cloud.store.execute("UPDATE vehicles SET arrived = 2").await;
     for (stream, arrival, time) in [("events", "1", 5), ("orchestrator", "2", 4)] {
-        let line = json!({ "stream": stream, "seq": 0, "time_ns": time, "boot_ns": 1, "boot": "b",
-                           "kind": stream, "record": {} });
+        let line = json!({ "stream": stream, "seq": 0, "time_ns": time, "boot_ns": time,
+                           "boot": "b", "kind": stream, "record": {} });
         let insert = "INSERT INTO streams (vehicle, stream, life, next, seq, boot, boot_ns)
                       VALUES ('car-1', $1, 1, 1, 0, '', 0)";
         cloud.store.execute_with(insert, &[stream]).await;

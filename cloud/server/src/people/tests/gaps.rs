@@ -29,7 +29,6 @@ async fn append(cloud: &Cloud, epoch: u64, seqs: Range<u64>, kept: u64) {
     cloud.hub.arrived(CAR);
 }
 
-/// Returns the next piece of a stream that is followed.
 async fn piece(body: &mut BodyDataStream) -> Vec<Value> {
     let bytes = body.next().await.unwrap().unwrap();
     let lines = bytes.split(|byte| *byte == b'\n').filter(|line| !line.is_empty());
@@ -43,7 +42,8 @@ async fn events_of_two_streams_come_in_the_order_of_their_times() {
     let epoch = connected(&cloud.store, CAR).await;
     for (stream, time) in [("events", 5), ("orchestrator", 4)] {
         let cursor = Cursor { stream: stream.to_owned(), life: 1, next: 1, ..Cursor::default() };
-        let line = json!({ "stream": stream, "seq": 0, "time_ns": time, "kind": "event" });
+        let line = json!({ "stream": stream, "seq": 0, "time_ns": time, "boot_ns": time,
+                           "boot": "b", "kind": "event" });
         let lines = vec![(0, String::new(), line.to_string())];
         let batch = StreamBatch { lines, cursor };
         cloud.store.append(CAR, epoch, batch, Retention::DEFAULT).await.unwrap();

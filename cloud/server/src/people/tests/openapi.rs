@@ -27,7 +27,6 @@ async fn the_description_has_each_request_and_a_foreign_tool_accepts_it() {
     python("-m", &["openapi_spec_validator", "--errors", "all", file.to_str().unwrap()]);
 }
 
-/// Checks each answer by its schema.
 const CHECK: &str = "
 import json, sys
 from jsonschema import Draft202012Validator
@@ -40,7 +39,6 @@ for operation, status, answer in answers:
     Draft202012Validator({**content['schema'], 'components': components}).validate(answer)
 ";
 
-/// Announces the clip `a` of the vehicle `car-7`.
 pub(super) async fn announce(store: &CloudStore) {
     let sha256 = gleaner_trust::sha256(b"01234");
     let clip = json!({ "name": "a", "from_ns": -1, "to_ns": 2, "bytes": 5, "sha256": sha256,

@@ -35,24 +35,20 @@ pub enum Storage {
     Sqlite3,
 }
 
-/// Creates a folder that is removed with its test.
 pub fn folder() -> TempDir {
     TempDir::new_in(env!("CARGO_TARGET_TMPDIR")).unwrap()
 }
 
-/// Returns the bytes of a message in a file.
 pub fn cdr(message: &Written) -> Vec<u8> {
     [&[0, 1, 0, 0][..], &message.value.to_le_bytes()].concat()
 }
 
-/// Creates a database with empty tables.
 pub fn empty_database(path: &Path) -> Connection {
     let db = Connection::open(path).unwrap();
     db.execute_batch(TABLES).unwrap();
     db
 }
 
-/// Adds a topic, and returns its number.
 pub fn add_topic(db: &Connection, topic: &str, type_name: &str) -> i64 {
     let sql = "INSERT INTO topics (name, type, serialization_format, offered_qos_profiles, \
                type_description_hash) \
@@ -91,7 +87,6 @@ pub fn database(path: &Path, messages: &[Written]) {
     database_of(path, messages, cdr);
 }
 
-/// Returns an MCAP file with `messages`, each converted by `bytes`.
 pub fn mcap_of(messages: &[Written], bytes: impl Fn(&Written) -> Vec<u8>) -> Vec<u8> {
     let mut writer = begin();
     for message in messages {
@@ -144,7 +139,6 @@ pub fn bag(storage: Storage, packing: Packing, parts: &[&[Written]]) -> TempDir 
     folder
 }
 
-/// Returns a `metadata.yaml` of this version.
 pub fn metadata(
     version: u32,
     storage: &str,
@@ -180,12 +174,10 @@ pub fn write_metadata(folder: &Path, text: &str) {
     fs::write(folder.join("metadata.yaml"), text).unwrap();
 }
 
-/// Options that unpack files in `folder`.
 pub fn unpack_in(folder: &Path) -> DriveOptions {
     DriveOptions { unpack_in: Some(folder.to_owned()), ..DriveOptions::default() }
 }
 
-/// Creates a database in `folder` with `messages`, and returns its path.
 pub fn database_in(folder: &TempDir, messages: &[Written]) -> PathBuf {
     let path = folder.path().join("drive.db3");
     database(&path, messages);

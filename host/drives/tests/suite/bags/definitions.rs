@@ -18,7 +18,6 @@ fn open(path: PathBuf, msg: Option<PathBuf>) -> Replay {
     Replay::open_as(&[path], &DriveOptions { sources, ..DriveOptions::default() }).unwrap()
 }
 
-/// Creates a folder with one definition.
 fn folder_with(package: &str, name: &str, text: &str) -> tempfile::TempDir {
     let folder = folder();
     let package = folder.path().join(package);

@@ -268,7 +268,6 @@ fn a_hostile_list_deletes_nothing_outside() {
     }
 }
 
-/// Returns the file of the only loss, which is a deletion.
 fn deleted(reported: &[Loss]) -> &str {
     let [Loss::Deleted { file, .. }] = reported else { panic!("{reported:?}") };
     file.to_str().unwrap()

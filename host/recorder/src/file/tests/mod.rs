@@ -31,7 +31,6 @@ fn begun(folder: &mut RecordingFolder, base: &str, messages: u64) -> UnfinishedC
     clip
 }
 
-/// Records a clip of six messages.
 fn record(folder: &mut RecordingFolder, base: &str) -> Clip {
     begun(folder, base, 6).finish(trailer()).unwrap()
 }

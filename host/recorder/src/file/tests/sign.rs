@@ -29,7 +29,6 @@ fn verify(clip: &[u8]) -> Result<SignedClip, ClipRefusal> {
     verify_clip(clip, &trusted(&[("car-7", 7)]))
 }
 
-/// Opens the folder as a recorder that signs.
 fn signing(scratch: &TestDir) -> RecordingFolder {
     let folder = RecordingFolder::open_without_recovery(&scratch.0).unwrap();
     folder.sign_clips(ClipSigner::new(key(7), "car-7".parse().unwrap()));

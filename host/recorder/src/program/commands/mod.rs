@@ -31,7 +31,6 @@ const REPORT_INTERVAL: Duration = Duration::from_secs(10);
 /// Maximum number of characters of a logged refusal: a message may contain any text.
 const WHY_MAX: usize = 200;
 
-/// Executes commands.
 pub struct Commands {
     topic: String,
     /// The topic's messages, once it is attached.
@@ -52,7 +51,6 @@ pub struct Commands {
 }
 
 impl Commands {
-    /// Returns the commands over `topic`.
     pub fn new(topic: String) -> Commands {
         Commands {
             topic,
@@ -204,7 +202,6 @@ impl Commands {
         warn!(topic = %self.topic, too_many, too_long, "commands refused unread");
     }
 
-    /// Returns the counts of commands.
     pub fn status(&self, network: Option<&ReceptionStatus>) -> CommandStatus {
         let (too_many, too_long) = self.unread();
         CommandStatus {

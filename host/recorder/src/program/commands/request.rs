@@ -7,7 +7,6 @@ use serde::Deserialize;
 /// Longest label, in bytes: that of a lambda's trigger.
 const LABEL_MAX: usize = 128;
 
-/// The reason why a command is refused.
 #[derive(Debug, thiserror::Error)]
 pub enum CommandError {
     #[error("the message has no text")]
@@ -34,7 +33,6 @@ pub enum CommandError {
     DiskSuppressed,
 }
 
-/// A parsed command.
 #[derive(Debug, PartialEq)]
 pub struct CommandRequest {
     /// The lambda in whose name it is given.
@@ -42,7 +40,6 @@ pub struct CommandRequest {
     pub trigger: Trigger,
 }
 
-/// The object in the text.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct CommandText {

@@ -28,7 +28,6 @@ impl Budget {
     }
 }
 
-/// A backfill in progress.
 #[derive(Debug)]
 pub struct Backfill {
     windows: Vec<Window>,
@@ -76,7 +75,6 @@ impl Backfill {
         Backfill { windows: Vec::new(), limit, settles: None, last, thumbnail_search: None }
     }
 
-    /// Restarts, as the preroll has moved.
     pub fn restart(&mut self) {
         (self.last, self.settles) = (None, None);
         if let Some(thumbnail_search) = &mut self.thumbnail_search {
@@ -84,7 +82,6 @@ impl Backfill {
         }
     }
 
-    /// The windows for which it is made.
     pub fn windows(&self) -> &[Window] {
         &self.windows
     }

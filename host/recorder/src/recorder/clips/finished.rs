@@ -25,7 +25,6 @@ pub struct Finished {
 }
 
 impl Finished {
-    /// Adds a clip, if it is finished already.
     pub fn add(&mut self, clip: Option<Clip>) {
         let Some(clip) = clip else { return };
         if self.newest.len() >= 2 * KEPT {
@@ -69,12 +68,10 @@ impl Finished {
         &self.newest
     }
 
-    /// Counts of finished, failed and deleted clips.
     pub fn counts(&self) -> &RecordingCounts {
         &self.counts
     }
 
-    /// Takes the errors of clips that could not be finished.
     pub fn take_failures(&mut self) -> Vec<RecordError> {
         std::mem::take(&mut self.failures)
     }
@@ -84,7 +81,6 @@ impl Finished {
         std::mem::take(&mut self.deleted)
     }
 
-    /// Takes the recovered clips of an earlier process.
     pub fn take_recovered(&mut self) -> Vec<Clip> {
         std::mem::take(&mut self.recovered)
     }

@@ -44,17 +44,14 @@ impl Clips {
         }
     }
 
-    /// The clips that are being made.
     pub fn progress(&self) -> &ClipsInProgress {
         &self.progress
     }
 
-    /// The clips that are being made.
     pub fn progress_mut(&mut self) -> &mut ClipsInProgress {
         &mut self.progress
     }
 
-    /// Adds a lambda; returns its number.
     pub fn add_lambda(&mut self, rules: WindowRules) -> usize {
         self.windows.add(rules)
     }
@@ -68,7 +65,6 @@ impl Clips {
         self.held.is_some()
     }
 
-    /// Triggers while recording was suspended.
     pub fn disk_suppressed(&self) -> u64 {
         self.disk_suppressed
     }
@@ -88,7 +84,6 @@ impl Clips {
         self.windows.set_grace(grace_ns);
     }
 
-    /// Raises the length of the longest clip.
     pub fn grow_length(&mut self, most_ns: i64) {
         self.windows.grow_length(self.progress.grow_length(most_ns));
     }
@@ -123,7 +118,6 @@ impl Clips {
         self.progress.wake(lambda, number, at_ns, encoded, &self.windows)
     }
 
-    /// Queues a moment for the clip that it belongs to.
     pub fn await_clip(&mut self, lambda: usize, moment: Moment) {
         self.progress.await_clip(lambda, moment, &self.windows);
     }
@@ -139,7 +133,6 @@ impl Clips {
         self.windows.trigger(lambda, kind, label, at_ns)
     }
 
-    /// As [`trigger`](Self::trigger), for a command.
     pub fn command(
         &mut self,
         lambda: usize,
@@ -150,14 +143,12 @@ impl Clips {
         self.windows.command(lambda, kind, label, at_ns)
     }
 
-    /// Applies the effects of triggers.
     pub fn act(&mut self, material: &mut Material) -> Result<(), RecordError> {
         self.run(material)?;
         self.progress.gather(&self.windows);
         Ok(())
     }
 
-    /// Ends the windows that a lambda has started.
     pub fn end_lambda(
         &mut self,
         lambda: usize,

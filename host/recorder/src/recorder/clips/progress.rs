@@ -65,7 +65,6 @@ impl ClipsInProgress {
         self.open.as_mut()
     }
 
-    /// Returns whether a clip is open.
     pub fn is_open(&self) -> bool {
         self.open.is_some()
     }
@@ -115,12 +114,10 @@ impl ClipsInProgress {
         self.disk.in_flight() as u64
     }
 
-    /// Queues a moment for the clip that it belongs to.
     pub fn await_clip(&mut self, lambda: usize, moment: Moment, windows: &Windows) {
         self.waiting.push(lambda, moment, windows, self.limits.waiting);
     }
 
-    /// Forgets places in the preroll, as it has moved.
     pub fn preroll_moved(&mut self) {
         if let Some(backfill) = &mut self.backfill {
             backfill.restart();
@@ -428,7 +425,6 @@ fn earliest(clip: &OpenClip, group: &Group, material: &Material) -> Option<i64> 
     earliest
 }
 
-/// Collects the triggers within a clip.
 fn gather(waiting: &mut WaitingTriggers, clip: &mut OpenClip, group: &Group, limit: i64) {
     let counted = waiting.take(group, limit, |moment| clip.moment(moment));
     clip.count_triggers(counted);

@@ -15,7 +15,6 @@ use crate::thumbnail::thumbnail;
 /// Maximum number of images that are tried until one can be decoded. Each costs some milliseconds.
 const IMAGE_TRIES: u32 = 8;
 
-/// The data that completes a clip.
 pub struct ClipCompletion {
     pub trailer: ClipTrailer,
     /// Topics that have a channel even if no message came.
@@ -38,7 +37,6 @@ pub struct ClipFile {
 }
 
 impl ClipFile {
-    /// Creates the file.
     pub fn begin(
         &mut self,
         folder: &mut RecordingFolder,
@@ -62,7 +60,6 @@ impl ClipFile {
         }
     }
 
-    /// Writes a message.
     pub fn write(&mut self, sample: ClipSample<'_>) -> Result<(), RecordError> {
         if self.images == Some(sample.topic) {
             self.thumbnail(sample);

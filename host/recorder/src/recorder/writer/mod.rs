@@ -25,7 +25,6 @@ use thread::{QueuedClip, WriterThread};
 /// Most bytes queued for the disk, except for one message that exceeds it.
 const IN_FLIGHT: usize = 16 << 20;
 
-/// A sample for a clip.
 #[derive(Copy, Clone, Debug)]
 pub struct ClipSample<'a> {
     /// Number of its topic.
@@ -35,7 +34,6 @@ pub struct ClipSample<'a> {
     pub cdr: &'a [u8],
 }
 
-/// The outcome of a clip.
 pub enum ClipOutcome {
     /// It is complete and listed; with the losses from making room for it.
     Finished(Box<Clip>, Vec<Loss>),
@@ -45,7 +43,6 @@ pub enum ClipOutcome {
     Failed(RecordError),
 }
 
-/// The folder of clips.
 pub enum ClipDisk {
     /// Each call returns when its work is done.
     Inline(Arc<Mutex<RecordingFolder>>),
@@ -54,17 +51,14 @@ pub enum ClipDisk {
 }
 
 impl ClipDisk {
-    /// Writes within each call.
     pub fn inline(folder: RecordingFolder) -> ClipDisk {
         ClipDisk::Inline(Arc::new(Mutex::new(folder)))
     }
 
-    /// Writes on a background thread.
     pub fn background(folder: RecordingFolder) -> Result<ClipDisk, RecordError> {
         Ok(ClipDisk::Background(WriterThread::start(folder)?))
     }
 
-    /// Returns the writer of a new clip.
     pub fn new_clip(&mut self) -> ClipWriter {
         match self {
             ClipDisk::Inline(folder) => {
@@ -86,7 +80,6 @@ impl ClipDisk {
         matches!(self, ClipDisk::Background(thread) if thread.queued() == 0)
     }
 
-    /// Collects the outcomes of clips.
     pub fn poll(&mut self, outcomes: &mut Vec<ClipOutcome>) -> Result<(), RecordError> {
         match self {
             ClipDisk::Inline(_) => Ok(()),
@@ -156,7 +149,6 @@ impl ClipWriter {
         }
     }
 
-    /// Makes the thumbnail from the messages of this topic.
     pub fn thumbnail_of(&mut self, topic: usize) -> Result<(), RecordError> {
         match self {
             ClipWriter::Inline(inline) => {
@@ -167,7 +159,6 @@ impl ClipWriter {
         }
     }
 
-    /// Makes the thumbnail preferably from this message.
     pub fn thumbnail(&mut self, sample: ClipSample<'_>) -> Result<(), RecordError> {
         match self {
             ClipWriter::Inline(inline) => {
@@ -178,7 +169,6 @@ impl ClipWriter {
         }
     }
 
-    /// Writes a message.
     pub fn write(&mut self, sample: ClipSample<'_>) -> Result<(), RecordError> {
         match self {
             ClipWriter::Inline(inline) => inline.file.write(sample),
@@ -186,7 +176,6 @@ impl ClipWriter {
         }
     }
 
-    /// Sends collected messages.
     pub fn flush(&mut self) -> Result<(), RecordError> {
         match self {
             ClipWriter::Inline(_) => Ok(()),

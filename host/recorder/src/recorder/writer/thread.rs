@@ -57,7 +57,6 @@ enum JobResult {
     Recovery,
 }
 
-/// Messages of one clip.
 #[derive(Default)]
 struct Batch {
     bytes: Vec<u8>,
@@ -118,14 +117,12 @@ impl Flow {
     }
 }
 
-/// The handle of the thread.
 pub struct WriterThread {
     jobs: Sender<WriterMessage>,
     /// Cost and result of each job.
     done: Receiver<(usize, JobResult)>,
     handle: Option<JoinHandle<()>>,
     flow: Arc<Flow>,
-    /// Number of clips so far.
     clips: u64,
     is_recovering: bool,
     /// The deadline of the recovery, once it is set.
@@ -220,7 +217,6 @@ impl Drop for WriterThread {
     }
 }
 
-/// A clip that the thread writes.
 pub struct QueuedClip {
     clip: u64,
     jobs: Sender<WriterMessage>,
@@ -256,7 +252,6 @@ impl QueuedClip {
         if after >= BATCH { self.flush() } else { Ok(()) }
     }
 
-    /// Sends the collected messages.
     pub fn flush(&mut self) -> Result<(), RecordError> {
         if self.batch.messages.is_empty() {
             return Ok(());

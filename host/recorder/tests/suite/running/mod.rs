@@ -122,7 +122,6 @@ impl LiveSource for FakeNetwork {
     }
 }
 
-/// The recorder, as a reader of the ingress.
 const NAME: &str = "recorder";
 
 /// The starter of a recorder, and of the ingress that it reads.
@@ -139,7 +138,6 @@ pub struct FakeStarter {
 }
 
 impl FakeStarter {
-    /// Starts both, on threads.
     pub fn start(
         network: &FakeNetwork,
         options: RecorderOptions,
@@ -208,7 +206,6 @@ impl FakeStarter {
     }
 }
 
-/// A recorder on a thread, with its reports.
 pub struct Running {
     pub starter: FakeStarter,
     reports: BufReader<PipeReader>,
@@ -249,7 +246,6 @@ impl Running {
         running
     }
 
-    /// Starts a recorder with a topic `/a`.
     pub fn start_with_a(scratch: &TestDir) -> (Running, FakeNetwork) {
         let network = FakeNetwork::default();
         network.add("/a");
@@ -264,23 +260,19 @@ impl Running {
         link
     }
 
-    /// Sends a wake with an event.
     pub fn event(&self, link: &mut RecorderLink) {
         link.wake(&entry(self.clock.now(), &[TriggerKind::Event]), monotonic(self.clock)).unwrap();
     }
 
-    /// Stops the recorder.
     pub fn stopped(mut self) -> (RecorderStatus, Result<(), Failure>) {
         self.starter.control.stop().unwrap();
         self.ended()
     }
 
-    /// Adds a lambda as the starter does.
     pub fn add(&mut self, add: &AddLambda) -> Result<OwnedFd, LinkError> {
         self.starter.add(add)
     }
 
-    /// Reads reports until one matches.
     pub fn until<T>(&mut self, mut matches: impl FnMut(RecorderReport) -> Option<T>) -> T {
         loop {
             let mut line = String::new();
@@ -330,7 +322,6 @@ pub fn lambda(scratch: &TestDir, name: &str, rolls_ms: (u32, u32)) -> (PathBuf, 
     (folder, header)
 }
 
-/// The header of a lambda with this manifest.
 pub fn with_manifest(header: JournalHeader, text: &str) -> JournalHeader {
     let sha256 = hex(&Sha256::digest(text));
     let manifest = FileDigest { path: "lambda.toml".to_owned(), bytes: text.len() as u64, sha256 };
@@ -401,7 +392,6 @@ impl Drop for Sensor {
     }
 }
 
-/// Waits for samples of `/a`.
 pub fn received(running: &mut Running, least: u64) {
     running.status(|status| {
         status.topics.iter().any(|topic| topic.topic == "/a" && topic.received >= least)

@@ -193,7 +193,6 @@ cooldown = "{cooldown}ms"
     LambdaSpec { header, rules, digest: "d1e5".to_owned(), topics: topics.to_vec() }
 }
 
-/// Adds topic `/a`, and a lambda that records it.
 pub fn add_hello(recorder: &mut Recorder, rolls_ms: (i64, i64, i64)) -> (TopicId, LambdaId) {
     let a = recorder.add_topic(topic("/a")).unwrap();
     (a, recorder.add_lambda(member("hello", rolls_ms, &[a])))

@@ -29,7 +29,7 @@ fn folder(names: &[&str]) -> (tempfile::TempDir, ClipFolder) {
 }
 
 fn new(clips: &ClipFolder, cursor: Option<&str>) -> Option<ClipReport> {
-    clips.new_clips(cursor, &[], &|| false).unwrap()
+    clips.clips(cursor, None, &[], &|| false).unwrap()
 }
 
 fn names(report: &Option<ClipReport>) -> Vec<&str> {
@@ -45,7 +45,7 @@ fn each_clip_is_read_once_and_a_list_that_was_begun_again_from_its_begin() {
     assert_eq!(facts.sha256.as_deref(), Some(sha256(b"a").as_str()));
     assert_eq!((facts.bytes, &*facts.moments[0].label), (1, "dark"));
     let cursor = first.unwrap().cursor.unwrap();
-    assert_eq!(new(&clips, Some(&cursor)), None);
+    assert_eq!((new(&clips, Some(&cursor)), offset(&cursor)), (None, Some(clips.length())));
     // A line that is still written does not count yet.
     let mut list = File::options().append(true).open(folder.path().join("clips.jsonl")).unwrap();
     let third = line("c");
@@ -75,22 +75,22 @@ fn names_with_paths_and_links_are_not_followed() {
     assert_eq!(names(&report), ["link"]);
     let facts = &report.as_ref().unwrap().clips[0];
     assert_eq!((&facts.sha256, &facts.thumbnail), (&None, &None));
-    let refused = clips.part(&facts.name, 6, 0).unwrap_err();
+    let refused = clips.piece(&facts.name, 6, (0, 6)).unwrap_err();
     assert!(is_gone(&refused), "{refused}");
 }
 
 #[test]
-fn a_part_is_of_the_file_that_was_announced() {
+fn a_piece_is_of_the_file_that_was_announced() {
     let (folder, clips) = folder(&["a"]);
     let path = folder.path().join("clips/a.mcap");
-    let part = gleaner_fleet::clips::CLIP_PART;
-    let content = vec![7; part as usize + 3];
-    fs::write(&path, &content).unwrap();
+    fs::write(&path, "0123456789").unwrap();
     let name: ClipName = "a".parse().unwrap();
-    assert_eq!(clips.part(&name, part + 3, 1).unwrap(), [7; 3]);
-    assert!(is_gone(&clips.part(&name, part, 0).unwrap_err()), "it has another length");
+    assert_eq!(clips.piece(&name, 10, (3, 4)).unwrap(), b"3456");
+    assert_eq!(clips.piece(&name, 10, (8, 4)).unwrap(), b"89");
+    assert!(is_gone(&clips.piece(&name, 10, (10, 4)).unwrap_err()), "it is beyond the end");
+    assert!(is_gone(&clips.piece(&name, 9, (0, 4)).unwrap_err()), "it has another length");
     fs::remove_file(path).unwrap();
-    assert!(is_gone(&clips.part(&name, part + 3, 1).unwrap_err()));
+    assert!(is_gone(&clips.piece(&name, 10, (0, 4)).unwrap_err()));
 }
 
 /// The digest was computed with `sha256sum`, over its own lines of the two files.

@@ -1,10 +1,38 @@
+use std::collections::BTreeMap;
 use std::fs;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
+use gleaner_fleet::clips::{ClipBudget, ClipFacts};
 use serde_json::{Value, json};
 use tempfile::TempDir;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::{TcpListener, TcpStream};
 
 use super::super::fake_cloud::{FakeCloud, soon};
 use super::*;
+
+/// Returns the task of a vehicle with these clips.
+fn sender(cloud: &FakeCloud, clips: &[(&str, &[u8])]) -> (TempDir, watch::Sender<u64>, ClipSender) {
+    let folder = TempDir::new().unwrap();
+    let api = crate::api::tests::vehicle(folder.path(), gleaner_lambda::Vehicle::default());
+    let own = ClipFolder(api.layout.clips());
+    fs::create_dir(own.0.join("clips")).unwrap();
+    let mut list = String::new();
+    for (name, content) in clips {
+        let file = format!("clips/{name}.mcap");
+        fs::write(own.0.join(&file), content).unwrap();
+        let image = format!("clips/{name}.jpg");
+        let line = json!({ "file": file, "thumbnail": image, "bytes": content.len(), "from_ns": 1,
+            "to_ns": 9, "first_ns": null, "last_ns": null, "triggers": 1, "moments": [],
+            "topics": [], "lambdas": [], "incomplete": [], "recovered": null });
+        list += &format!("{line}\n");
+    }
+    fs::write(own.0.join("clips.jsonl"), list).unwrap();
+    let (generation, wanted) = watch::channel(0);
+    let tracker = Arc::clone(&api.cloud.clips);
+    let sender = ClipSender::new(api.core, own, cloud.http.clone(), wanted, tracker);
+    (folder, generation, sender)
+}
 
 /// Answers the requests of a vehicle in turn; returns these, and the failure after the last one.
 async fn served(
@@ -29,22 +57,14 @@ async fn served(
     (reports, failure.to_string())
 }
 
+fn orders(cursor: &Value, thumbnails: Value, wanted: Value) -> Value {
+    json!({ "cursor": cursor, "thumbnails": thumbnails, "wanted": wanted })
+}
+
 #[tokio::test]
 async fn orders_of_a_hostile_cloud_are_refused_or_answered_with_the_reason() {
-    let folder = TempDir::new().unwrap();
-    let api = crate::api::tests::vehicle(folder.path(), gleaner_lambda::Vehicle::default());
     let cloud = FakeCloud::start().await;
-    let clips = ClipFolder(api.layout.clips());
-    fs::create_dir(clips.0.join("clips")).unwrap();
-    fs::write(clips.0.join("clips/a.mcap"), "abc").unwrap();
-    let line = json!({ "file": "clips/a.mcap", "thumbnail": null, "bytes": 3, "from_ns": 1,
-        "to_ns": 9, "first_ns": null, "last_ns": null, "triggers": 1, "moments": [],
-        "topics": [], "lambdas": [], "incomplete": [], "recovered": null });
-    fs::write(clips.0.join("clips.jsonl"), format!("{line}\n")).unwrap();
-    let (_wanted, wanted) = watch::channel(0);
-    let mut sender = ClipSender::new(api.core, clips, cloud.http.clone(), wanted);
-
-    let orders = |cursor: &Value, thumbnails: Value, wanted: Value| json!({ "cursor": cursor, "thumbnails": thumbnails, "wanted": wanted });
+    let (_folder, _wanted, mut sender) = sender(&cloud, &[("a", b"abc")]);
     let nothing = orders(&Value::Null, json!([]), json!([]));
     // Without the position after them, the vehicle does not send the same clips for ever.
     let answers = [nothing.clone(), nothing.clone()];
@@ -53,17 +73,18 @@ async fn orders_of_a_hostile_cloud_are_refused_or_answered_with_the_reason() {
     assert!(failure.contains("did not store the list"), "{failure}");
 
     let cursor = json!(reports[1].cursor);
-    let part = |name: &str, bytes: u64, part: u64| {
-        let wanted = json!([{ "name": name, "bytes": bytes, "sha256": "", "part": part }]);
+    let piece = |name: &str, bytes: u64, from: Option<u64>| {
+        let wanted = json!([{ "name": name, "bytes": bytes, "sha256": "", "part": 0,
+            "from": from }]);
         orders(&cursor, json!([]), wanted)
     };
     let answers = [
         orders(&cursor, json!(["gone"]), json!([])),
-        part("gone", 3, 0),
-        part("a", 1 << 60, 0),
-        part("a", 3, 1),
-        part("a", 3, u64::MAX),
-        part("../../state.json", 3, 0),
+        piece("gone", 3, Some(0)),
+        piece("a", 1 << 60, Some(0)),
+        piece("a", 3, Some(3)),
+        piece("a", 3, Some(u64::MAX)),
+        piece("../../state.json", 3, Some(0)),
     ];
     let (reports, failure) = served(&cloud, &mut sender, &answers).await;
     assert!(failure.contains("its answer cannot be parsed"), "{failure}");
@@ -72,4 +93,195 @@ async fn orders_of_a_hostile_cloud_are_refused_or_answered_with_the_reason() {
     let (deleted, other) = ("the vehicle has deleted the file", "unexpected end of file");
     let other = ("a", false, other);
     assert_eq!(gone, [("gone", true, deleted), ("gone", false, deleted), other, other, other]);
+    let (_, failure) = served(&cloud, &mut sender, &[piece("a", 3, None)]).await;
+    assert!(failure.contains("takes no pieces"), "{failure}");
+}
+
+/// Serves as a cloud that keeps what has come of each piece, and no thumbnail, until it has so many
+/// clips; returns these.
+async fn stored(cloud: &FakeCloud, count: usize) -> BTreeMap<ClipName, Vec<u8>> {
+    let (mut clips, mut files) = (Vec::new(), BTreeMap::new());
+    let mut orders = ClipOrders::default();
+    loop {
+        let mut connection = cloud.accept().await;
+        let Some((head, body, is_whole)) = connection.request_so_far().await else { continue };
+        let path: Vec<_> = head.split(' ').nth(1).unwrap().split('/').collect();
+        if let [_, _, _, name, "from", begin] = path[..] {
+            let file: &mut Vec<u8> = files.entry(name.parse().unwrap()).or_default();
+            assert_eq!(begin, file.len().to_string(), "it goes on where the cloud is");
+            file.extend(body);
+        } else if !path.contains(&"thumbnail") {
+            let report: ClipReport = serde_json::from_slice(&body).unwrap();
+            orders.cursor = report.cursor.or(orders.cursor);
+            clips.extend(report.clips);
+        }
+        let wanted = clips.iter().map(|ClipFacts { name, bytes, .. }| {
+            let from = files.get(name).map_or(0, |file| file.len() as u64);
+            let (name, sha256) = (name.clone(), String::new());
+            WantedClip { name, bytes: *bytes, sha256, part: 0, from: Some(from) }
+        });
+        orders.wanted = wanted.filter(|it| it.from < Some(it.bytes)).collect();
+        let images = clips.iter().filter(|facts| facts.thumbnail.is_some());
+        orders.thumbnails = images.map(|facts| facts.name.clone()).collect();
+        if is_whole {
+            let answer = serde_json::to_vec(&orders).unwrap();
+            let head = format!("200 OK\r\ncontent-length: {}", answer.len());
+            connection.answer(&head, &answer).await;
+        }
+        if clips.len() == count && orders.wanted.is_empty() {
+            return files;
+        }
+    }
+}
+
+/// Forwards connections, and ends each after so many bytes of the vehicle; also counts these.
+async fn cutting(target: String, most: usize) -> (String, Arc<AtomicUsize>) {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let (address, sent) =
+        (listener.local_addr().unwrap().to_string(), Arc::<AtomicUsize>::default());
+    let count = Arc::clone(&sent);
+    tokio::spawn(async move {
+        loop {
+            let (mut vehicle, _) = listener.accept().await.unwrap();
+            let mut cloud = TcpStream::connect(&target).await.unwrap();
+            let ((mut from, mut to), (mut answers, mut pieces)) = (vehicle.split(), cloud.split());
+            let forward = async {
+                let (mut left, mut piece) = (most, [0; 1000]);
+                while left > 0 {
+                    let room = left.min(piece.len());
+                    let read = from.read(&mut piece[..room]).await.unwrap_or(0);
+                    if read == 0 || pieces.write_all(&piece[..read]).await.is_err() {
+                        return;
+                    }
+                    left -= read;
+                    count.fetch_add(read, Ordering::Relaxed);
+                }
+            };
+            tokio::select! { () = forward => {}, _ = tokio::io::copy(&mut answers, &mut to) => {} }
+            // Closed with unread answers, the kernel would drop bytes that were forwarded.
+            let _ = pieces.shutdown().await;
+            let _ = tokio::io::copy(&mut answers, &mut tokio::io::sink()).await;
+        }
+    });
+    (address, sent)
+}
+
+#[tokio::test]
+async fn a_clip_arrives_over_connections_that_end_and_little_more_than_it_is_sent() {
+    for (length, most) in [(3_000_000, 1_000_000), (600_000, 100_000), (300_000, 60_000)] {
+        let content: Vec<u8> = (0..length).map(|byte| (byte / 7) as u8).collect();
+        let cloud = FakeCloud::start().await;
+        let (_folder, _wanted, mut sender) = sender(&cloud, &[("a", &content)]);
+        let (address, sent) = cutting(cloud.http.address.clone(), most).await;
+        sender.http.address = address;
+        let sending = tokio::spawn(sender.run());
+        let files = soon(stored(&cloud, 1)).await;
+        sending.abort();
+        assert!(files.values().eq([&content]), "{most}");
+        let sent = sent.load(Ordering::Relaxed);
+        assert!(sent * 10 <= length * 12, "{sent} of {length} over {most} at a time");
+    }
+}
+
+#[tokio::test]
+async fn a_thumbnail_that_no_connection_can_carry_keeps_no_clip_back() {
+    let cloud = FakeCloud::start().await;
+    let (_folder, _wanted, mut sender) = sender(&cloud, &[("a", b"abc"), ("b", b"other")]);
+    fs::write(sender.folder.0.join("clips/a.jpg"), [7; 150_000]).unwrap();
+    sender.http.address = cutting(cloud.http.address.clone(), 100_000).await.0;
+    let sending = tokio::spawn(sender.run());
+    let files = soon(stored(&cloud, 2)).await;
+    sending.abort();
+    assert!(files.values().eq([&b"abc"[..], b"other"]));
+}
+
+#[tokio::test]
+async fn an_unreadable_clip_is_announced_with_its_cause_and_again_once_it_can_be_read() {
+    let cloud = FakeCloud::start().await;
+    let (_folder, _wanted, mut sender) = sender(&cloud, &[("a", b"abc"), ("b", b"other")]);
+    let bad = sender.folder.0.join("clips/a.bad");
+    fs::write(&bad, "").unwrap();
+    let nothing = orders(&Value::Null, json!([]), json!([]));
+    let (reports, _) = served(&cloud, &mut sender, &[nothing.clone(), nothing.clone()]).await;
+    let [first, second] = &reports[1].clips[..] else { panic!("{reports:?}") };
+    assert!(first.unreadable.as_ref().is_some_and(|cause| cause.contains("os error 5")));
+    assert_eq!((second.name.as_str(), &second.unreadable), ("b", &None));
+    assert_eq!(sender.tracked(|it| it.status().unreadable), 1);
+
+    fs::remove_file(&bad).unwrap();
+    let listed = orders(&json!(reports[1].cursor), json!([]), json!([]));
+    let (reports, _) = served(&cloud, &mut sender, &[listed, json!("no orders")]).await;
+    let [again] = &reports[1].clips[..] else { panic!("{reports:?}") };
+    assert_eq!((again.name.as_str(), again.sha256.is_some()), ("a", true));
+    let status = sender.tracked(|it| it.status());
+    assert_eq!((status.unannounced_bytes, status.unreadable), (Some(0), 1), "it was not stored");
+    let current = sender.current.take();
+    assert_eq!(current.as_ref().map(|(name, _)| name.as_str()), Some("a"), "it is to blame");
+    sender.tracked(|it| it.announced(&current.unwrap().0, true));
+    assert_eq!(sender.tracked(|it| it.status().unreadable), 0);
+}
+
+#[tokio::test]
+async fn a_portal_is_named_once_after_some_attempts_with_growing_pauses() {
+    let cloud = FakeCloud::start().await;
+    let (_folder, _wanted, mut sender) = sender(&cloud, &[("a", b"abc")]);
+    let portal = async {
+        let mut connection = cloud.accept().await;
+        connection.request().await.unwrap();
+        let head = "200 OK\r\ncontent-type: text/html; charset=utf-8\r\ncontent-length: 6";
+        connection.answer(head, b"<html>").await;
+    };
+    let (Err(failure), ()) = soon(async { tokio::join!(sender.serve(), portal) }).await;
+    for attempt in 1..=6 {
+        let (pause, event) = sender.tracked(|it| it.fail(None, &failure));
+        assert_eq!(pause, Duration::from_millis(1 << (attempt - 1)));
+        assert_eq!(event.is_some(), attempt == 5, "{event:?}");
+    }
+    let stuck = sender.tracked(|it| it.status().stuck.unwrap());
+    assert_eq!((stuck.name, stuck.attempts), (None, 6));
+    assert!(stuck.cause.contains("a portal or proxy is in between"), "{}", stuck.cause);
+}
+
+#[test]
+fn a_clip_without_progress_waits_for_others_and_all_for_the_budget_of_the_next_day() {
+    let mut tracker = ClipTracker::default();
+    let wanted = |name: &str, from| WantedClip {
+        name: name.parse().unwrap(),
+        bytes: 9,
+        sha256: String::new(),
+        part: 0,
+        from: Some(from),
+    };
+    let mut orders =
+        ClipOrders { wanted: vec![wanted("a", 0), wanted("b", 0)], ..Default::default() };
+    let budget = |day, is_spent| Some(ClipBudget { day, bytes: 10, is_spent });
+    orders.budget = budget(1, false);
+    orders.thumbnails = vec!["b".parse().unwrap()];
+    assert_eq!(tracker.status().waiting, None);
+    tracker.learn(&orders, 0);
+    assert_eq!(tracker.status().waiting, Some(2));
+    let next = |tracker: &mut ClipTracker| {
+        let ((name, is_thumbnail), _) = tracker.next()?;
+        tracker.attempt((name.clone(), is_thumbnail));
+        Some(format!("{name} {is_thumbnail}"))
+    };
+    for expected in ["b true", "a false", "b false", "b true"] {
+        assert_eq!(next(&mut tracker).as_deref(), Some(expected), "the fewest attempts are first");
+    }
+    assert_eq!(tracker.piece(), 64 << 10);
+    tracker.arrived(64 << 10);
+    assert_eq!((tracker.piece(), tracker.piece()), (128 << 10, 64 << 10));
+    orders.wanted[1] = wanted("b", 5);
+    tracker.learn(&orders, 0);
+    assert_eq!(next(&mut tracker).as_deref(), Some("b false"), "it has made progress");
+    tracker.send(10);
+    assert_eq!(next(&mut tracker), None);
+    assert!(tracker.status().paused.unwrap().contains("of today were sent"));
+    orders.budget = budget(2, false);
+    tracker.learn(&orders, 0);
+    assert_eq!(next(&mut tracker).as_deref(), Some("a false"));
+    // A cloud whose budget is used up wants nothing.
+    tracker.learn(&ClipOrders { budget: budget(2, true), ..ClipOrders::default() }, 0);
+    assert!(tracker.status().paused.unwrap().contains("of today were sent"));
+    assert_eq!(tracker.status().waiting, None);
 }

@@ -3,6 +3,7 @@
 
 use std::io;
 use std::num::NonZeroU8;
+use std::path::PathBuf;
 use std::sync::mpsc;
 
 use gleaner_base::ByteSize;
@@ -20,6 +21,7 @@ use tokio::time::{sleep, timeout};
 use super::*;
 use crate::cloud::LinkState;
 use crate::durable::DurableFile;
+use crate::spools::STREAMS;
 use simulated::{DiskFault, SimulatedDisk};
 
 #[expect(dead_code, reason = "the disk of the tests of `gleaner-spool`")]
@@ -127,13 +129,15 @@ impl Spools {
         std::fs::remove_dir_all(self.path(stream)).unwrap();
     }
 
-    /// Returns the lines of a stream, from a number on.
+    /// Returns the lines of a stream that are sent, from a number on.
     fn lines(&self, stream: &str, from: Option<u64>) -> Vec<StreamLine> {
         let of = last_part(stream);
         let reader = SpoolReader::open(&self.path(stream), of, from).unwrap();
         // As they arrive: JSON has no order of keys.
         let parse = |line| serde_json::from_slice(&serde_json::to_vec(&line).unwrap()).unwrap();
-        reader.map(|item| parse(line(of, item))).collect()
+        let note = |gap: &SpoolGap| gap.reason == GapReason::Budget && gap.record.is_some();
+        let is_sent = |item: &_| !matches!(item, Ok(SpoolItem::Gap(gap)) if note(gap));
+        reader.filter(is_sent).map(|item| parse(line(of, item))).collect()
     }
 
     /// Opens a connection to a cloud that has `cursors`.
@@ -142,9 +146,9 @@ impl Spools {
         let (orders, received) = mpsc::sync_channel(STREAMS_HERE.len());
         let cloud = Cloud::load(DurableFile::new(self.path("cloud.json"))).0;
         cloud.set_state(LinkState::Connected, None, None);
-        let (spool, view) = (self.folder.path().to_owned(), cloud.clone());
-        let uplink = Uplink { spool, cloud, cursors, out, orders: received };
-        let sent = tokio::task::spawn_blocking(move || uplink.run());
+        let (spools, view) = (SpoolFolders(self.folder.path().to_owned()), cloud.clone());
+        let uplink = Uplink::new(spools, cloud, cursors, out);
+        let sent = tokio::task::spawn_blocking(move || uplink.run(&received));
         OpenUplink { frames, orders, sent, view }
     }
 
@@ -171,10 +175,11 @@ impl Spools {
 
     /// Returns whether a cloud has everything.
     fn are_in(&self, cloud: &StoredRecords) -> bool {
-        let has = |(stream, writer): (&&str, &SpoolWriter)| {
-            cloud.cursors.get(*stream).is_some_and(|it| it.next == writer.status().next)
+        let has = |stream: &&str| {
+            let cursor = cloud.cursors.get(*stream);
+            cursor.is_some_and(|it| self.lines(stream, Some(it.next)).is_empty())
         };
-        self.writers.iter().all(has)
+        self.writers.keys().all(has)
     }
 }
 
@@ -200,7 +205,13 @@ impl StoredRecords {
             }
             // It would skip a record that it has, but none has to come again.
             assert!(is_gap || line.seq >= before, "record {} of `{stream}` came again", line.seq);
-            self.lines.entry(stream.clone()).or_default().push((*life, line));
+            let stored = self.lines.entry(stream.clone()).or_default();
+            let missing = line.seq..=line.record["to"].as_u64().filter(|_| is_gap).unwrap_or(0);
+            let has = |(it, other): &(u64, StreamLine)| {
+                it == life && other.kind != "gap" && missing.contains(&other.seq)
+            };
+            assert!(!is_gap || !stored.iter().any(has), "it has records of {missing:?}");
+            stored.push((*life, line));
         }
         cursor.next = before.max(*next);
         Ack { stream: stream.clone(), life: *life, next: cursor.next }
@@ -348,6 +359,30 @@ async fn what_the_budget_removes_after_the_cloud_has_it_is_no_gap() {
 }
 
 #[tokio::test]
+async fn what_the_budget_removes_while_it_is_sent_is_no_gap_and_what_it_removes_before_is_one() {
+    let (mut vehicle, mut cloud) = (Spools::new(), StoredRecords::default());
+    vehicle.boot(0);
+    vehicle.add("lambdas/brake", 0, 20, 20);
+    let mut uplink = vehicle.open(BTreeMap::new());
+    let first = batch(&mut uplink.frames).await;
+    assert_eq!((&*first.stream, first.next), ("lambdas/brake", 20));
+    vehicle.add("lambdas/brake", 1, 600, 25);
+    let oldest = vehicle.lines("lambdas/brake", None)[0].seq;
+    uplink.orders.send(UplinkOrder::Ack(cloud.store(&first))).unwrap();
+    while !vehicle.lines("lambdas/brake", Some(cloud.cursors["lambdas/brake"].next)).is_empty() {
+        let batch = batch(&mut uplink.frames).await;
+        uplink.orders.send(UplinkOrder::Ack(cloud.store(&batch))).unwrap();
+    }
+    drop((uplink.frames, uplink.orders));
+    uplink.sent.await.unwrap();
+    let arrived = cloud.of_life("lambdas/brake", 1, 0);
+    assert!(oldest > 20, "the budget has removed what was sent, too");
+    // It may have read some before they were removed.
+    let gaps = gaps(&arrived);
+    assert!(matches!(gaps[..], [(20.., to, "Budget")] if to == oldest - 1), "{gaps:?}");
+}
+
+#[tokio::test]
 async fn a_stream_that_cannot_be_read_is_named_until_it_is_gone() {
     let mut vehicle = Spools::new();
     vehicle.boot(0);
@@ -356,15 +391,15 @@ async fn a_stream_that_cannot_be_read_is_named_until_it_is_gone() {
     std::fs::write(&odd, "no folder").unwrap();
     let mut uplink = vehicle.open(BTreeMap::new());
     batch(&mut uplink.frames).await;
-    let until = async |has_reason| {
-        while uplink.view.lock().reason.is_some() != has_reason {
+    let until = async |is_failing| {
+        while uplink.view.lock().failing.is_empty() == is_failing {
             sleep(Duration::from_millis(2)).await;
         }
     };
-    timeout(DEADLINE, until(true)).await.expect("it is named beside the number");
-    assert_eq!(uplink.view.lock().unsent, 5);
-    let reason = uplink.view.lock().reason.clone().unwrap();
-    assert!(reason.starts_with("stream `lambdas/odd` cannot be sent"), "{reason}");
+    timeout(DEADLINE, until(true)).await.expect("it is named");
+    let failing = uplink.view.lock().failing();
+    assert_eq!((failing.len(), failing[0].streams), (1, 1));
+    assert!(failing[0].example.starts_with("`lambdas/odd`: cannot use the spool folder"));
     std::fs::remove_file(odd).unwrap();
     timeout(DEADLINE, until(false)).await.expect("it is named until it is removed");
     let lambdas = vehicle.path("lambdas");
@@ -400,26 +435,59 @@ fn a_power_cut_takes_nothing_that_was_sent() {
     for seed in 0..50 {
         let disk = SimulatedDisk::new(seed);
         let (mut stream, all) = unsynced(&disk);
-        let sent = stream.batch("lambdas/brake", true, Instant::now()).unwrap();
+        let sent = stream.batch("lambdas/brake", true, Instant::now()).0.unwrap();
         disk.power_cut();
-        assert_eq!((sent.count, sent.next), (10, 10));
+        assert_eq!(sent.next, 10);
         assert_eq!(decompress(&sent.lines).unwrap(), all);
         assert_eq!(lines_on(&disk), all, "seed {seed}");
     }
 }
 
+/// A stream on a disk whose operations fail; also each list and each opening of its folder is one.
+struct SimulatedSpool(SimulatedDisk);
+
+impl SpoolSource for SimulatedSpool {
+    type Storage = SimulatedDisk;
+
+    fn streams(&self) -> (Vec<String>, io::Result<()>) {
+        match self.0.list() {
+            Ok(_) => (vec!["lambdas/brake".to_owned()], Ok(())),
+            Err(error) => (Vec::new(), Err(error)),
+        }
+    }
+
+    fn open(&self, stream: &str) -> Result<SimulatedDisk, SpoolError> {
+        let failed = |source| SpoolError::Folder { path: stream.into(), source };
+        self.0.list().map(|_| self.0.clone()).map_err(failed)
+    }
+}
+
 #[test]
-fn after_an_operation_that_fails_each_record_is_sent_once() {
-    let mut delayed = 0;
-    for at in 1..40 {
+fn each_operation_that_fails_once_is_in_the_status_until_all_records_are_sent_once() {
+    let folder = TempDir::new().unwrap();
+    for at in 1..60 {
         let disk = SimulatedDisk::new(at);
-        let (mut stream, all) = unsynced(&disk);
+        let (_, all) = unsynced(&disk);
+        let cloud = Cloud::load(DurableFile::new(folder.path().join("cloud.json"))).0;
+        let (view, (out, mut frames)) = (cloud.clone(), channel(9));
+        let (spools, cursors) = (SimulatedSpool(disk.clone()), BTreeMap::new());
+        let mut uplink = Uplink::new(spools, cloud, cursors, out);
         let (from, kind) = (disk.operations() + at, io::ErrorKind::Other);
         disk.set_fault(Some(DiskFault { from, count: 1, kind }));
-        let batches = [(); 3].map(|()| stream.batch("lambdas/brake", true, Instant::now()));
-        delayed += u64::from(batches[0].is_none());
-        let sent = batches.iter().flatten().map(|batch| decompress(&batch.lines).unwrap());
-        assert_eq!(sent.collect::<Vec<_>>().concat(), all, "operation {at}");
+        let (mut stored, mut sent) = (StoredRecords::default(), Vec::new());
+        let (mut now, mut has_failed) = (Instant::now(), false);
+        for _ in 0..30 {
+            assert!(uplink.look(true, now));
+            has_failed |= !view.lock().failing().is_empty();
+            while let Ok(Body::Records(batch)) = frames.try_recv() {
+                sent.extend(decompress(&batch.lines).unwrap());
+                assert!(uplink.acknowledged(&stored.store(&batch), now));
+                has_failed |= !view.lock().failing().is_empty();
+            }
+            now += INTERVAL;
+        }
+        assert_eq!(sent, all, "operation {at}");
+        assert!(has_failed && view.lock().failing().is_empty(), "operation {at}");
+        assert_eq!(disk.released().unwrap(), 10, "operation {at}");
     }
-    assert!(delayed >= 3, "failed syncs of both segments and of names");
 }

@@ -25,7 +25,6 @@ impl ClipJournals {
         ClipJournals { limits, ..ClipJournals::default() }
     }
 
-    /// Keeps a wake.
     pub fn push(&mut self, lambda: usize, number: u64, encoded: &[u8]) {
         let part = at(&mut self.parts, lambda);
         let (before, cut) = (part.bytes(), part.cut());
@@ -44,7 +43,6 @@ impl ClipJournals {
         self.bytes
     }
 
-    /// Counts wakes that the preroll has evicted.
     pub fn evicted(&mut self, lambda: usize, count: u64) {
         *at(&mut self.evicted, lambda) += count;
     }

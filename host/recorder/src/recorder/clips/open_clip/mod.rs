@@ -20,7 +20,6 @@ use crate::recorder::sources::RecordedSources;
 use crate::recorder::writer::{ClipCompletion, ClipSample, ClipWriter};
 use crate::window::Group;
 
-/// The reason for the end of a clip.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum CloseReason {
     /// No window is open any more.
@@ -66,7 +65,6 @@ pub struct OpenClip {
     /// True if its file is begun.
     is_begun: bool,
     messages: u64,
-    /// Counts of messages, by topic.
     tallies: Vec<TopicTally>,
     moments: Vec<Moment>,
     journals: ClipJournals,
@@ -121,7 +119,6 @@ impl OpenClip {
         self.group
     }
 
-    /// Its begin.
     pub fn from(&self, group: &Group) -> i64 {
         self.from.min(group.from)
     }
@@ -149,7 +146,6 @@ impl OpenClip {
         &mut self.journals
     }
 
-    /// Sets the time without an ingress.
     pub fn lacks_ingress(&mut self, outage_ns: i64) {
         self.outage_ns = outage_ns;
     }
@@ -166,7 +162,6 @@ impl OpenClip {
         }
     }
 
-    /// Keeps a trigger.
     pub fn moment(&mut self, moment: Moment) {
         self.triggers += 1;
         if self.moments.len() < self.limits.moments {
@@ -251,7 +246,6 @@ impl OpenClip {
         self.writer.thumbnail(ClipSample { topic, schema, meta, cdr })
     }
 
-    /// Writes a message.
     pub fn write(
         &mut self,
         topic: usize,

@@ -4,7 +4,6 @@ use super::{plural, seconds};
 use crate::file::ClipTopicCounts;
 use crate::recorder::sources::RecordedSources;
 
-/// The counts of one topic in a clip.
 #[derive(Clone, Debug)]
 pub struct TopicTally {
     pub messages: u64,
@@ -36,7 +35,6 @@ impl Default for TopicTally {
 }
 
 impl TopicTally {
-    /// Counts a message that no clip can hold.
     pub fn refuse(&mut self) {
         self.too_big = self.too_big.map(|count| count + 1);
         self.huge += 1;

@@ -10,7 +10,7 @@ const LINES: RateLimit = RateLimit::of(1.0 / 60.0, 1.0);
 
 /// The numbers of connections or streams that a bound has ended and refused, since the start.
 #[derive(Debug)]
-pub(crate) struct BoundCounts {
+pub struct BoundCounts {
     things: &'static str,
     state: Mutex<CountedEnds>,
 }
@@ -23,20 +23,21 @@ struct CountedEnds {
 }
 
 impl BoundCounts {
-    pub(crate) const fn of(things: &'static str) -> Self {
+    /// Creates counts of connections or streams with the name `things` in the log.
+    pub const fn of(things: &'static str) -> Self {
         let state = Mutex::new(CountedEnds { ended: 0, refused: 0, lines: LINES });
         Self { things, state }
     }
 
     /// Counts one that has ended for another one.
-    pub(crate) fn ended(&self) {
+    pub fn ended(&self) {
         let mut state = self.lock();
         state.ended += 1;
         self.log(state);
     }
 
     /// Counts one that was refused.
-    pub(crate) fn refused(&self) {
+    pub fn refused(&self) {
         let mut state = self.lock();
         state.refused += 1;
         self.log(state);
@@ -48,15 +49,20 @@ impl BoundCounts {
         }
         let (things, ended, refused) = (self.things, state.ended, state.refused);
         drop(state);
-        tracing::warn!(things, ended, refused, "a bound was reached, here since the start");
+        tracing::warn!(
+            things,
+            ended,
+            refused,
+            "limit of connections or streams hit, numbers since the start"
+        );
     }
 
     fn lock(&self) -> MutexGuard<'_, CountedEnds> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    #[cfg(test)]
-    pub(crate) fn numbers(&self) -> (u64, u64) {
+    /// Returns how many have ended for another one, and how many were refused.
+    pub fn numbers(&self) -> (u64, u64) {
         let state = self.lock();
         (state.ended, state.refused)
     }

@@ -1,0 +1,53 @@
+//! The models of a lambda, as they are passed to the process.
+
+use std::fs::File;
+use std::path::Path;
+use std::sync::Arc;
+
+use gleaner_base::{Exit, Failure, PlainFile};
+use gleaner_lambda::layout::FILE_MAX;
+use gleaner_lambda::manifest::ModelSpec;
+use gleaner_protocol::inference::{GrantedModel, ModelEngine, ModelFile};
+
+use super::engine;
+
+/// A model that the process may load.
+#[derive(Clone)]
+pub(super) struct PassedModel {
+    pub(super) model: ModelFile,
+    pub(super) file: Arc<File>,
+    /// Entry with its engine.
+    pub(super) engine: Option<Arc<File>>,
+}
+
+/// Returns a model of a manifest, as its lambda may use it.
+pub(super) fn granted(model: &ModelSpec) -> GrantedModel {
+    GrantedModel {
+        name: model.name.to_string(),
+        sha256: model.sha256.to_string(),
+        providers: model.providers.clone(),
+        threads: u32::try_from(model.threads).ok(),
+        refused: None,
+    }
+}
+
+impl PassedModel {
+    /// Opens the file of a model in the build `build`, and its engine if there is one.
+    pub(super) fn open(model: &ModelSpec, build: &Path) -> Result<Self, Failure> {
+        let file = PlainFile::inside(build, model.file.as_path(), FILE_MAX);
+        let file = file.map(PlainFile::into_file).map_err(|error| {
+            let message =
+                format!("cannot open `{}`, the file of model `{}`", model.file, model.name);
+            Failure::caused_by(Exit::Usage, message, &error)
+                .with_help("build the lambda again: gleaner build DIR")
+        })?;
+        let (sha256, path) = (model.sha256.to_string(), model.file.to_string());
+        let (engine, entry) = match engine::stored(&sha256) {
+            Ok(Some(entry)) => (ModelEngine::Attached, Some(entry)),
+            Ok(None) => (ModelEngine::None, None),
+            Err(reason) => (ModelEngine::Refused(reason), None),
+        };
+        let (file, entry) = (Arc::new(file), entry.map(Arc::new));
+        Ok(Self { model: ModelFile { sha256, path, engine }, file, engine: entry })
+    }
+}

@@ -1,0 +1,33 @@
+//! The process, and how long it may be without a report: it sends one every 5 s.
+
+use std::os::unix::net::UnixStream;
+use std::process::Child;
+use std::sync::Arc;
+use std::sync::atomic::AtomicU64;
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+/// Longest time until the first report: libraries may be read from a slow disk.
+pub(super) const START: Duration = Duration::from_secs(60);
+
+/// Longest time between two looks at the reports: this program may have stood still itself.
+pub(super) const STEP: Duration = Duration::from_secs(1);
+
+pub(super) struct Process {
+    pub(super) child: Child,
+    /// Open, as its end would mean that this program has ended.
+    #[expect(dead_code, reason = "it is only kept open")]
+    pub(super) handover: UnixStream,
+    pub(super) readers: Vec<JoinHandle<()>>,
+    /// Number of reports so far.
+    pub(super) reports: Arc<AtomicU64>,
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        if let Ok(None) = self.child.try_wait() {
+            let _ = self.child.kill();
+            let _ = self.child.wait();
+        }
+    }
+}
