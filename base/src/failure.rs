@@ -107,6 +107,10 @@ const ERROR: &str = "error: ";
 const CAUSE: &str = "  cause: ";
 const HELP: &str = "  help:  ";
 
+/// The way out of EAGAIN of `fork` and `clone`, which the policy SCHED_DEADLINE gets, too.
+const NO_PROCESS_HELP: &str = "permit more processes (`ulimit -u`, the container's limit); below \
+                               `chrt --deadline`, add `--reset-on-fork`";
+
 /// The error's own message becomes the failed action; its sources are the causes.
 impl<E: Explain> From<E> for Failure {
     fn from(error: E) -> Failure {
@@ -124,7 +128,8 @@ impl fmt::Display for Failure {
             f.write_str("\n")?;
             write_labelled(f, CAUSE, cause)?;
         }
-        if let Some(help) = &self.help {
+        let is_eagain = self.causes.iter().any(|cause| cause.ends_with("(os error 11)"));
+        if let Some(help) = self.help.as_deref().or(is_eagain.then_some(NO_PROCESS_HELP)) {
             f.write_str("\n")?;
             write_labelled(f, HELP, help)?;
         }

@@ -185,8 +185,8 @@ impl EngineBuild<'_> {
                 }
                 Ok(InferenceEvent::Stderr(text)) => print_error(&String::from_utf8_lossy(&text)),
                 Ok(InferenceEvent::Warning(text)) => self.show(&text),
-                Ok(InferenceEvent::Report(_) | InferenceEvent::Refused(_))
-                | Err(RecvTimeoutError::Timeout) => {}
+                Ok(InferenceEvent::Refused(text)) => return Err(self.failed(visible(&text))),
+                Ok(InferenceEvent::Report(_)) | Err(RecvTimeoutError::Timeout) => {}
                 Err(RecvTimeoutError::Disconnected) => {
                     return Err(self.failed("its process is not supervised"));
                 }

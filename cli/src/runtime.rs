@@ -185,7 +185,8 @@ fn start(
 ) -> Result<Child, RuntimeError> {
     let mut command = Command::new(shim.as_ref().unwrap_or(&runtime));
     if shim.is_some() {
-        command.args([starter(), "--".into()]).arg(&runtime);
+        // Only components run below it here: what they cannot do needs no layer of the system.
+        command.args([starter(), "--component".into(), "--".into()]).arg(&runtime);
     }
     let program = shim.unwrap_or(runtime);
     let failed = |source| RuntimeError::Start { program: program.clone(), source };

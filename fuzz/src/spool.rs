@@ -157,7 +157,11 @@ impl<'a> SpoolStorage for ReadOnly<'a> {
         found.map(|(_, bytes)| ReadOnlySegment(bytes)).ok_or_else(|| io::ErrorKind::NotFound.into())
     }
 
-    fn create(&self, _: u64) -> io::Result<ReadOnlySegment<'a>> {
+    fn create(&self) -> io::Result<ReadOnlySegment<'a>> {
+        Err(io::ErrorKind::ReadOnlyFilesystem.into())
+    }
+
+    fn publish(&self, _: u64) -> io::Result<()> {
         Err(io::ErrorKind::ReadOnlyFilesystem.into())
     }
 

@@ -6,23 +6,23 @@
 /// Lines of Rust and Python of each folder at the top, without generated files: of sources, and of
 /// tests.
 pub const LINES: &[(&str, usize, usize)] = &[
-    ("base", 1243, 669),
+    ("base", 1248, 669),
     ("bench", 11757, 745),
-    ("cli", 11190, 4437),
-    ("cloud", 19276, 6515),
+    ("cli", 11199, 4452),
+    ("cloud", 19413, 6587),
     ("examples", 1318, 757),
-    ("fuzz", 4216, 86),
+    ("fuzz", 4135, 83),
     ("guest-sdk-python", 5883, 4113),
     ("guest-sdk-rust", 5394, 1621),
-    ("host", 62560, 30311),
-    ("journal", 1869, 1266),
-    ("lambda", 4680, 2183),
-    ("orchestrator", 25806, 8417),
-    ("player", 2242, 793),
-    ("report", 2802, 913),
-    ("rules", 2707, 1191),
-    ("tests", 6579, 12434),
-    ("xtask", 6951, 774),
+    ("host", 62842, 30395),
+    ("journal", 1854, 1251),
+    ("lambda", 4669, 2169),
+    ("orchestrator", 26099, 8618),
+    ("player", 2214, 793),
+    ("report", 2764, 908),
+    ("rules", 2700, 1179),
+    ("tests", 6580, 12452),
+    ("xtask", 6893, 765),
 ];
 
 /// Files with functions of more than 80 lines, each with its reason.

@@ -1,7 +1,7 @@
 //! Checks the isolation layers of a lambda's process: `gleaner-shim` sets each one up and tests it.
 
 use gleaner_parts::Parts;
-use gleaner_protocol::{Holds, Layer, REQUIRED_HELP};
+use gleaner_protocol::{Holds, Layer};
 
 use super::{Finding, Severity, output_of};
 
@@ -29,21 +29,12 @@ fn layers(parts: &Parts) -> Result<Vec<Layer>, String> {
 
 fn finding(layer: &Layer) -> Finding {
     let detail = format!("{}: {}", layer.name, layer.note);
-    match layer.holds {
-        Holds::Yes => Finding::ok("isolation", detail),
-        Holds::No if layer.prevents_lambdas() => Finding {
-            subject: "isolation",
-            state: Severity::Error,
-            detail: format!("no lambda can run: {detail}"),
-            help: Some(REQUIRED_HELP.to_owned()),
-        },
-        Holds::Partly | Holds::No => Finding {
-            subject: "isolation",
-            state: Severity::Warning,
-            detail,
-            help: Some(
-                "Python lambdas are isolated by fewer layers; see docs/security.md".to_owned(),
-            ),
-        },
-    }
+    let (state, detail) = match layer.holds {
+        Holds::Yes => return Finding::ok("isolation", detail),
+        Holds::No if layer.prevents_lambdas() => {
+            (Severity::Error, format!("no lambda can run: {detail}"))
+        }
+        Holds::Partly | Holds::No => (Severity::Warning, detail),
+    };
+    Finding { subject: "isolation", state, detail, help: Some(layer.help().to_owned()) }
 }

@@ -6,6 +6,7 @@ use std::os::fd::AsRawFd;
 
 use gleaner_base::{Exit, ignored_variables};
 use gleaner_parts::Parts;
+use gleaner_protocol::ingress::DISCOVERY_GROUP;
 use nix::ifaddrs::getifaddrs;
 use nix::net::if_::InterfaceFlags;
 use rustix::process::{PidfdFlags, PidfdGetfdFlags, getpid, pidfd_getfd, pidfd_open};
@@ -161,9 +162,8 @@ fn has_multicast_route(routes: &str, interface: &str) -> bool {
         let (Some(destination), Some(mask)) = (address(Some(destination)), address(mask)) else {
             return false;
         };
-        // The multicast group that every participant joins.
-        let group = Ipv4Addr::new(239, 255, 0, 1);
-        name == interface && u32::from(group) & u32::from(mask) == u32::from(destination)
+        let group = u32::from(DISCOVERY_GROUP);
+        name == interface && group & u32::from(mask) == u32::from(destination)
     })
 }
 

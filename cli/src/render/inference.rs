@@ -28,7 +28,10 @@ pub(crate) fn inference(report: &InferenceReport, paint: Paint) -> String {
     written(|text| match report {
         InferenceReport::Model(model) => write_model(text, model, paint),
         InferenceReport::Ended(status) => write_status(text, status, paint),
-        InferenceReport::Ready | InferenceReport::Try(_) | InferenceReport::Status(_) => Ok(()),
+        InferenceReport::Starting
+        | InferenceReport::Ready
+        | InferenceReport::Try(_)
+        | InferenceReport::Status(_) => Ok(()),
     })
 }
 

@@ -400,7 +400,11 @@ fn wait(
             let message = format!("deployment `{id}` does not run after {seconds}");
             let phase = lambda.map(|it| format!("it is {}", it.phase.as_str()));
             let end = lambda.and_then(|it| it.last_end.as_deref()).map(in_one_line);
-            let causes = phase.into_iter().chain(end).collect();
+            // A lambda waits for it, and has no reason of its own.
+            let ingress = status.supervisor.as_ref().map(|supervisor| &supervisor.ingress);
+            let ingress = ingress.filter(|ingress| !ingress.is_ready);
+            let ingress = ingress.and_then(|it| it.last_end.as_deref()).map(in_one_line);
+            let causes = phase.into_iter().chain(end).chain(ingress).collect();
             return Err(Failure { causes, ..Failure::new(Exit::Differs, message) }
                 .with_help("it goes on: `gleaner status` and `gleaner events` show it"));
         }

@@ -64,6 +64,11 @@ pub(super) fn text(status: &VehicleStatus, paint: Paint) -> String {
         None => text += &format!("  {}\n", paint.red("the supervisor does not run")),
         Some(supervisor) => {
             text += &service("ingress", Some(&supervisor.ingress), paint);
+            for health in supervisor.ingress.last.iter().map(|last| &last.health) {
+                let unfiltered = health.network.iter().flat_map(|it| &it.unfiltered);
+                let lacks = unfiltered.chain(&health.dead);
+                text.extend(lacks.map(|why| format!("    {}\n", paint.yellow(&in_one_line(why)))));
+            }
             text += &service("recorder", supervisor.recorder.as_ref(), paint);
             text += &losses(supervisor.recorder.as_ref(), paint);
             text += &service("inference", supervisor.inference.as_ref(), paint);
@@ -159,20 +164,24 @@ fn failing_lines(failing: &[FailingStreams], paint: Paint) -> String {
     failing.iter().map(line).collect()
 }
 
-/// Returns the line of records that could not be written to a spool.
+/// Returns the line of records that could not be written to a spool, or cannot be now.
 fn records_lost(lost: &StreamLoss) -> String {
     let name = lost.stream.strip_prefix("lambdas/").unwrap_or(&lost.stream);
     let help = match &*lost.reason {
         "DiskFull" | "WriteFailed" => "; check the disk and its room",
         _ => "",
     };
-    format!(
-        "records of `{}` lost: {}, the last one at {}: {}{help}",
-        visible(name),
-        grouped(lost.records),
-        UtcTime::of(lost.last_ns.div_euclid(1_000_000_000)),
-        gap_reason(&lost.reason),
-    )
+    let counts = [
+        ("lost", lost.records, "the last one at", lost.last_ns),
+        ("waiting for the disk", lost.waiting, "since", lost.failing_ns),
+    ];
+    let counts = counts.into_iter().filter(|(_, count, ..)| *count > 0);
+    let counts = counts.map(|(what, count, when, ns)| {
+        let time = UtcTime::of(ns.div_euclid(1_000_000_000));
+        format!("{what}: {}, {when} {time}", grouped(count))
+    });
+    let counts = counts.collect::<Vec<_>>().join("; ");
+    format!("records of `{}` {counts}: {}{help}", visible(name), gap_reason(&lost.reason))
 }
 
 /// Returns the line of clips on their way to the cloud, if there are any.
@@ -188,8 +197,8 @@ fn clips_line(clips: &ClipsStatus, paint: Paint) -> String {
     parts.extend(clips.paused.as_deref().map(in_one_line));
     parts.extend(clips.stuck.as_ref().map(|stuck| {
         let name = stuck.name.as_deref().map_or("the list".to_owned(), visible);
-        let since = format_duration(Duration::from_secs(stuck.since_s.max(0.0) as u64));
-        let (attempts, cause) = (stuck.attempts, in_one_line(&stuck.cause));
+        let (attempts, since) = (stuck.attempts, seconds(stuck.since_s));
+        let cause = in_one_line(&stuck.cause);
         let line = format!("no progress of {name} in {attempts} attempts for {since}: {cause}");
         paint.yellow(&line)
     }));
@@ -302,4 +311,20 @@ fn row(deployment: &DeploymentStatus) -> [String; 11] {
         or_dash(latency, |it| format!("{:.2} ms", it.p99_ns as f64 / 1e6)),
         or_dash(live, |live| size(live.rss_bytes)),
     ]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_stream_that_a_full_disk_refuses_is_named_with_counts_and_times() {
+        let (stream, reason) = ("lambdas/brake".to_owned(), "DiskFull".to_owned());
+        let (last_ns, failing_ns) = (1_000_000_060_000_000_000, 1_000_000_000_000_000_000);
+        let loss = StreamLoss { stream, records: 2, reason, last_ns, waiting: 1266, failing_ns };
+        let counts = "lost: 2, the last one at 2001-09-09T01:47:40Z; \
+                      waiting for the disk: 1,266, since 2001-09-09T01:46:40Z";
+        let cause = "the disk was full; check the disk and its room";
+        assert_eq!(records_lost(&loss), format!("records of `brake` {counts}: {cause}"));
+    }
 }

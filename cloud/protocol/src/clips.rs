@@ -325,6 +325,10 @@ pub struct ClipOrders {
     pub thumbnails: Vec<ClipName>,
     /// Clips whose files it lacks, the most important first.
     pub wanted: Vec<WantedClip>,
+    /// Clips that the vehicle could not read, and reads again, also after a restart: at most as
+    /// many as in a report, the pulled ones first. An older cloud states none.
+    #[serde(default)]
+    pub unreadable: Vec<ClipName>,
     /// Bytes that the vehicle may send. An older cloud states none.
     #[serde(default)]
     pub budget: Option<ClipBudget>,

@@ -45,9 +45,9 @@ async fn main() {
         tokio::spawn(drive(vehicle, name, labels, is_hostile));
     }
     admin.call(Method::POST, "/v1/vehicles", json!({ "name": "car-3" })).await;
-    let fallback = Signed::new("hard-brake", 1, None);
-    let newest = Signed::new("hard-brake", 2, Some(&fallback));
-    for signed in [Signed::new("brake-dark", 1, None), fallback, newest] {
+    let fallback = Signed::new("hard-brake", 1, None, 0);
+    let newest = Signed::new("hard-brake", 2, Some(&fallback), 0);
+    for signed in [Signed::new("brake-dark", 1, None, 0), fallback, newest] {
         admin.deploy(&signed).await;
     }
     let invited = json!({ "name": "ann", "role": "admin" });

@@ -35,6 +35,8 @@ pub(crate) struct Cloud {
     pub(crate) readers: Arc<Readers>,
     /// Pages that are read whole, apart from streams, which last.
     pub(crate) page_readers: Arc<Readers>,
+    /// Files that are sent and received, with a descriptor each.
+    pub(crate) transfers: Arc<Readers>,
     pub(crate) tails: Arc<Tails>,
     /// Frames of vehicles that are parsed and stored at a time.
     pub(crate) stored_frames: Semaphore,

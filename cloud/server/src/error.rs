@@ -12,6 +12,9 @@ use crate::sqlx;
 
 const PROBLEM: &str = "application/problem+json";
 
+/// Time after which a request may be sent again that a limit has refused, in s.
+const RETRY_S: &str = "10";
+
 /// Longest text of an error of the framework that is used as a cause.
 pub(crate) const TEXT_MAX: usize = 4 << 10;
 
@@ -157,7 +160,9 @@ impl IntoResponse for CloudError {
         }
         let problem = Problem::new(self.failure, self.status.as_u16());
         let text = serde_json::to_string(&problem).unwrap_or_default();
-        (self.status, [(header::CONTENT_TYPE, PROBLEM)], text).into_response()
+        let retry = [StatusCode::TOO_MANY_REQUESTS, StatusCode::SERVICE_UNAVAILABLE];
+        let retry = retry.contains(&self.status).then_some([(header::RETRY_AFTER, RETRY_S)]);
+        (self.status, retry, [(header::CONTENT_TYPE, PROBLEM)], text).into_response()
     }
 }
 

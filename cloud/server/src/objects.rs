@@ -24,8 +24,9 @@ use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 use crate::folder::PART;
 use crate::place::{FilePlace, blocking};
+use crate::readers::ReaderSlot;
 use crate::store::CloudStore;
-use crate::transfer::{IncomingFile, OCTETS, OutgoingFile};
+use crate::transfer::{IncomingFile, OCTETS, OutgoingFile, PIECE_TIME};
 
 /// Interval of looks for revisions and files that no release needs.
 const COLLECTING: Duration = Duration::from_secs(3600);
@@ -114,8 +115,8 @@ impl Objects {
         let number = self.parts.fetch_add(1, Ordering::Relaxed);
         let path = self.place.folder().join(format!("{sha256}.{number}.{PART}"));
         let name = format!("the file {sha256}");
-        let file = IncomingFile { name: &name, length, sha256: sha256.as_str() };
-        let part = file.receive(path, body).await?;
+        let file = IncomingFile { name: &name, length };
+        let part = file.receive(sha256.as_str(), PIECE_TIME, path, body).await?;
         Ok(self.place.keep(&part, sha256.as_str()).await.map_err(|error| {
             Failure::caused_by(Exit::Internal, format!("cannot store {name}"), &error)
         })?)
@@ -141,14 +142,19 @@ impl Objects {
     }
 
     /// Returns the answer with a file, or with the end of it.
-    pub(crate) async fn send(&self, sha256: &Sha256, headers: &HeaderMap) -> CloudResult<Response> {
+    pub(crate) async fn send(
+        &self,
+        slot: ReaderSlot,
+        sha256: &Sha256,
+        headers: &HeaderMap,
+    ) -> CloudResult<Response> {
         let name = format!("the file {sha256}");
         let help = "deploy the revision again, which sends missing files";
         let length = self.place.length(sha256.as_str()).await;
         let content = async |begin| self.place.content(sha256.as_str(), begin).await;
         let sha256 = Some(sha256.as_str());
         OutgoingFile { name: &name, kind: OCTETS, help, sha256 }
-            .send(headers, length, content)
+            .send(slot, headers, length, content)
             .await
     }
 }

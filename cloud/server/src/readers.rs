@@ -1,4 +1,5 @@
-//! Streams of records that people read: bounded for each user and for all.
+//! Streams of records that people read, and files that are sent and received: bounded for each user
+//! or vehicle, and for all.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -12,9 +13,11 @@ use tokio::time::{Instant, sleep_until};
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 
-/// Maximum number of streams that are read at a time, by all users and by one.
+/// Maximum number of streams that are read at a time, by all users and by one; the latter also of
+/// files, of which a vehicle may have fewer: some may be of connections that it has lost.
 const READERS_MAX: usize = 64;
 const OF_USER_MAX: usize = 16;
+const OF_VEHICLE_MAX: usize = 8;
 
 /// Interval at which the right to read is looked up: a token expires, and other replicas remove it.
 const LOOK: Duration = Duration::from_millis(if cfg!(test) { 20 } else { 2000 });
@@ -22,6 +25,9 @@ const LOOK: Duration = Duration::from_millis(if cfg!(test) { 20 } else { 2000 })
 /// The streams that are being read.
 pub(crate) struct Readers {
     open: Mutex<HashMap<String, OpenReaders>>,
+    things: &'static str,
+    /// Maximum number of them.
+    most: usize,
     counts: BoundCounts,
 }
 
@@ -40,28 +46,41 @@ pub(crate) struct ReaderSlot {
 impl Readers {
     /// Creates the bound of streams or pages, which the log has under the name `things`.
     pub(crate) fn new(things: &'static str) -> Arc<Self> {
-        Arc::new(Self { open: Mutex::default(), counts: BoundCounts::of(things) })
+        Self::bounded(things, READERS_MAX)
     }
 
-    /// Begins to read a stream for a user.
-    ///
-    /// # Errors
-    ///
-    /// An error if too many are read already.
+    pub(crate) fn bounded(things: &'static str, most: usize) -> Arc<Self> {
+        let (open, counts) = (Mutex::default(), BoundCounts::of(things));
+        Arc::new(Self { open, things, most, counts })
+    }
+
+    /// Begins to read a stream, or a transfer, for a user, unless there are too many already.
     pub(crate) fn open(self: &Arc<Self>, user: &str) -> CloudResult<ReaderSlot> {
+        self.open_of(user, OF_USER_MAX)
+    }
+
+    pub(crate) fn open_of_vehicle(self: &Arc<Self>, name: &str) -> CloudResult<ReaderSlot> {
+        self.open_of(&format!("vehicle {name}"), OF_VEHICLE_MAX)
+    }
+
+    fn open_of(self: &Arc<Self>, user: &str, of_one: usize) -> CloudResult<ReaderSlot> {
         let mut all = self.lock();
-        let busy = |message| {
+        let busy = |who: &str, most| {
             self.counts.refused();
-            CloudError::busy(message, "end another `gleaner logs -f`, or close a page")
+            let message = format!("{who} has {most} {}, which is the limit", self.things);
+            CloudError::busy(message, "end a `gleaner logs -f`, a page or a transfer, or wait")
         };
-        if all.values().map(|it| it.count).sum::<usize>() >= READERS_MAX {
-            return Err(busy("too many streams are read already"));
+        // The more one has, the more it leaves to others: few that are slow do not hold all.
+        let own = all.get(user).map_or(0, |it| it.count);
+        let open = all.values().map(|it| it.count).sum();
+        if open + own >= self.most {
+            return Err(busy("the cloud", open));
         }
         let of_user = all
             .entry(user.to_owned())
             .or_insert_with(|| OpenReaders { count: 0, end: watch::Sender::new(()) });
-        if of_user.count >= OF_USER_MAX {
-            return Err(busy("you read too many streams already"));
+        if of_user.count >= of_one {
+            return Err(busy(user, of_one));
         }
         of_user.count += 1;
         let ended = of_user.end.subscribe();
@@ -161,5 +180,8 @@ mod tests {
         let more: Vec<_> = (0..READERS_MAX).map(|user| readers.open(&user.to_string())).collect();
         assert_eq!(more.iter().filter(|it| it.is_ok()).count(), READERS_MAX - OF_USER_MAX);
         assert_eq!(readers.counts.numbers(), (0, 1 + OF_USER_MAX as u64));
+        let few = Readers::bounded("files", 5);
+        let open = ["ann", "ann", "ann", "ann", "bob", "bob", "eve"].map(|it| few.open(it));
+        assert_eq!(open.map(|it| it.is_ok()), [true, true, true, false, true, false, true]);
     }
 }

@@ -361,7 +361,7 @@ mod tests {
             let file = OutgoingFile { name: "a file", kind: OCTETS, help: "", sha256 };
             let length = place.length(name).await;
             let content = async |begin| place.content(name, begin).await;
-            let answer = file.send(&HeaderMap::new(), length, content).await;
+            let answer = file.send((), &HeaderMap::new(), length, content).await;
             let answer = answer.map_err(|error| error.reason())?;
             let body = axum::body::to_bytes(answer.into_body(), 100).await;
             body.map_err(|error| error.to_string())

@@ -10,8 +10,9 @@ use axum::response::Response;
 use axum::serve::{Listener, ListenerExt};
 use gleaner_base::{Exit, Failure};
 use gleaner_fleet::entrance::Entrance;
+use rustix::net::sockopt::set_tcp_user_timeout;
 use rustls::ServerConfig;
-use tokio::net::TcpListener;
+use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{Semaphore, watch};
 use tokio::task::JoinSet;
 
@@ -39,6 +40,10 @@ const VEHICLES_MAX: usize = 40_000;
 /// Maximum number of connections that have not shown a vehicle's certificate yet. A vehicle needs
 /// less than a second, so 1,536 of a fleet behind one address can begin in that time.
 const STRANGERS_MAX: usize = 1536;
+/// Descriptors that connections and files leave to the database, the log and short reads.
+const DESCRIPTORS_KEPT: usize = 64;
+/// Time after which a connection ends whose other side takes no byte, in ms.
+const UNREAD_MS: u32 = if cfg!(test) { 1000 } else { 60_000 };
 /// Interval at which times of signs of life are stored.
 const SEEN_INTERVAL: Duration = Duration::from_secs(30);
 /// Interval at which waves of releases are looked at.
@@ -207,6 +212,7 @@ impl CloudServer {
             account_changes: AccountChanges::default(),
             readers: Readers::new("streams of records"),
             page_readers: Readers::new("pages of records"),
+            transfers: Readers::bounded("transfers of files", descriptors(1)),
             tails: Arc::default(),
             stored_frames: Semaphore::new(STORED_FRAMES_MAX),
             retention: Retention::DEFAULT,
@@ -222,8 +228,7 @@ impl CloudServer {
         entrances.spawn(entrance.serve());
         // Each has a task of its own: one that waits for the database must not hold it up.
         if cloud.store.is_shared() {
-            let working = Arc::clone(&cloud);
-            let is_alone = bucket.is_none();
+            let (working, is_alone) = (Arc::clone(&cloud), bucket.is_none());
             chores.spawn(async move { replicas::keep_lease(&working, is_alone, failure).await });
             let working = Arc::clone(&cloud);
             chores.spawn(async move { replicas::follow(&working, hints).await });
@@ -268,8 +273,8 @@ fn people_entrance(
     is_behind_proxy: bool,
     stop: watch::Receiver<bool>,
 ) -> Entrance<impl Listener<Addr = SocketAddr>> {
-    let listener = listener.tap_io(|stream| drop(stream.set_nodelay(true)));
-    let most = PEOPLE_MAX.min(gleaner_base::open_files_max() / 8);
+    let listener = listener.tap_io(tune);
+    let most = PEOPLE_MAX.min(descriptors(2));
     let router = people::router(cloud).layer(map_response(counted));
     let plain = Entrance::plain(listener, ("people connections", most), router, stop);
     Entrance { is_behind_proxy, ..plain }
@@ -281,14 +286,24 @@ fn vehicles_entrance(
     tls: watch::Receiver<Arc<ServerConfig>>,
     stop: watch::Receiver<bool>,
 ) -> Entrance<impl Listener<Addr = SocketAddr>> {
-    let listener = listener.tap_io(|stream| drop(stream.set_nodelay(true)));
-    // With those of people, an eighth of the descriptors is left for files: without one, neither a
-    // record nor a clip could be stored.
-    let eighth = gleaner_base::open_files_max() / 8;
-    let strangers = ("vehicle connections", STRANGERS_MAX.min(eighth));
+    let listener = listener.tap_io(tune);
+    let strangers = ("vehicle connections", STRANGERS_MAX.min(descriptors(2)));
     let router = vehicles::router(cloud).layer(map_response(counted));
     let plain = Entrance::plain(listener, strangers, router, stop);
-    Entrance { tls: Some(tls), known: VEHICLES_MAX.min(5 * eighth), ..plain }
+    Entrance { tls: Some(tls), known: VEHICLES_MAX.min(descriptors(10)), ..plain }
+}
+
+/// Returns so many sixteenths of the descriptors for connections and files, which take 15 of them:
+/// without the others, no record could be stored.
+fn descriptors(sixteenths: usize) -> usize {
+    gleaner_base::open_files_max().saturating_sub(DESCRIPTORS_KEPT) / 16 * sixteenths
+}
+
+/// Makes a connection send at once, and end if its other side takes none of what is sent.
+fn tune(stream: &mut TcpStream) {
+    // One without these works, too.
+    let _ = stream.set_nodelay(true);
+    let _ = set_tcp_user_timeout(&*stream, UNREAD_MS);
 }
 
 async fn counted(answer: Response) -> Response {
@@ -371,4 +386,25 @@ fn host(address: &str) -> Result<&str, Failure> {
         Failure::new(Exit::Usage, format!("`{shown}` is no address of a cloud"))
             .with_help("name a host and a port with --name, as in cloud.example.org:8443")
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::ErrorKind;
+
+    use tokio::io;
+    use tokio::time::timeout;
+
+    use super::*;
+
+    #[tokio::test]
+    async fn a_connection_whose_other_side_reads_nothing_ends() {
+        let listener = TcpListener::bind(("127.0.0.1", 0)).await.unwrap();
+        let _reader = TcpStream::connect(listener.local_addr().unwrap()).await.unwrap();
+        let mut stream = listener.tap_io(tune).accept().await.0;
+        // Once all buffers are full, a write waits for the other side.
+        let end = async { io::copy(&mut io::repeat(0), &mut stream).await };
+        let end = timeout(Duration::from_secs(60), end).await.expect("it has not ended");
+        assert_eq!(end.unwrap_err().kind(), ErrorKind::TimedOut);
+    }
 }

@@ -10,7 +10,7 @@ use axum::response::{IntoResponse, Response};
 use futures_util::stream::try_unfold;
 use futures_util::{Stream, StreamExt, TryStreamExt};
 use gleaner_base::{Exit, Failure};
-use gleaner_fleet::UnfinishedFile;
+use gleaner_fleet::{AnnouncedFile, UnfinishedFile};
 use sha2::{Digest, Sha256};
 use tokio::fs::File;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -22,6 +22,9 @@ use crate::error::{CloudError, CloudResult};
 pub(crate) const PIECE_TIME: Duration = Duration::from_secs(60);
 /// Slowest rate of a whole file, in bytes/s.
 const RATE_MIN: u64 = 14_000;
+/// Time for a body that is not wanted, and its longest part that is read.
+const UNWANTED_TIME: Duration = Duration::from_secs(30);
+const UNWANTED_MAX: usize = 8 << 20;
 /// Length of the pieces in which a file is sent.
 const PIECE: usize = 64 << 10;
 
@@ -31,31 +34,22 @@ pub(crate) struct IncomingFile<'f> {
     /// Its name in messages.
     pub(crate) name: &'f str,
     pub(crate) length: u64,
-    pub(crate) sha256: &'f str,
 }
 
 impl IncomingFile<'_> {
-    /// Receives it into a new file. Without the right length and digest, nothing of it stays.
-    pub(crate) async fn receive(self, path: PathBuf, body: Body) -> CloudResult<UnfinishedFile> {
-        self.receive_within(PIECE_TIME, path, body).await
-    }
-
-    async fn receive_within(
+    /// Receives it into a new file, with at most so much time for each piece. Without the right
+    /// length and digest, nothing of it stays.
+    pub(crate) async fn receive(
         self,
+        sha256: &str,
         piece_time: Duration,
         path: PathBuf,
         body: Body,
     ) -> CloudResult<UnfinishedFile> {
-        let (received, end) = self.receive_some(piece_time, path, body).await?;
+        let (file, received, end) = self.receive_some(piece_time, path, body).await?;
         end?;
-        let ReceivedPiece { file, bytes, sha256 } = received;
-        match bytes == self.length && sha256 == self.sha256 {
-            true => Ok(file),
-            false => Err(self.refused(format!(
-                "it has {bytes} of {} bytes, and the SHA-256 {sha256}",
-                self.length
-            ))),
-        }
+        received.finish(sha256).map_err(|reason| self.refused(reason))?;
+        Ok(file)
     }
 
     /// Receives as much as comes; also returns the reason why the body did not end in time.
@@ -64,14 +58,14 @@ impl IncomingFile<'_> {
         piece_time: Duration,
         path: PathBuf,
         body: Body,
-    ) -> CloudResult<(ReceivedPiece, CloudResult<()>)> {
+    ) -> CloudResult<(UnfinishedFile, AnnouncedFile, CloudResult<()>)> {
         let Self { name, length, .. } = self;
         let failed = |error: io::Error| {
             Failure::caused_by(Exit::Internal, format!("cannot store {name}"), &error)
         };
         let mut file = File::create_new(&path).await.map_err(failed)?;
         let part = UnfinishedFile(path);
-        let (mut body, mut digest, mut bytes) = (body.into_data_stream(), Sha256::new(), 0);
+        let (mut body, mut received) = (body.into_data_stream(), AnnouncedFile::new(length));
         let time = piece_time + Duration::from_secs(length / RATE_MIN);
         let until = Instant::now() + time;
         let end = loop {
@@ -86,17 +80,16 @@ impl IncomingFile<'_> {
                 }
                 Ok(Some(Ok(piece))) => piece,
             };
-            let fits = piece.len().min(usize::try_from(length - bytes).unwrap_or(usize::MAX));
-            digest.update(&piece[..fits]);
-            file.write_all(&piece[..fits]).await.map_err(failed)?;
-            bytes += fits as u64;
-            if fits < piece.len() {
-                break Err(self.refused(format!("it is longer than {length} bytes")));
+            let before = received.received();
+            let added = received.add(&piece);
+            let fits = piece.slice(..(received.received() - before) as usize);
+            file.write_all(&fits).await.map_err(failed)?;
+            if let Err(reason) = added {
+                break Err(self.refused(reason));
             }
         };
         file.flush().await.map_err(failed)?;
-        let sha256 = gleaner_base::hex(&digest.finalize());
-        Ok((ReceivedPiece { file: part, bytes, sha256 }, end))
+        Ok((part, received, end))
     }
 
     fn refused(&self, reason: String) -> CloudError {
@@ -109,6 +102,14 @@ impl IncomingFile<'_> {
         CloudError::late(message, "send it again, over a faster connection")
             .because(format!("nothing, or not all of it, came within {} s", time.as_secs()))
     }
+}
+
+/// Reads the begin of a body that is not wanted: unread, it could hide the answer from its sender.
+pub(crate) async fn skip(body: Body) {
+    let pieces = body.into_data_stream().map_err(drop);
+    let skipped =
+        pieces.try_fold(UNWANTED_MAX, async |left, piece| left.checked_sub(piece.len()).ok_or(()));
+    let _ = timeout(UNWANTED_TIME, skipped).await;
 }
 
 /// Bytes of a file, as many as have come of them.
@@ -135,8 +136,10 @@ pub(crate) struct OutgoingFile<'f> {
 impl OutgoingFile<'_> {
     /// Returns the answer with the file, or with the end of it that the header `Range` requests.
     /// `content` returns what begins at a byte; it and `length` are `None` if there is no file.
+    /// The answer has `slot` until all of it is sent.
     pub(crate) async fn send(
         self,
+        slot: impl Send + 'static,
         headers: &HeaderMap,
         length: io::Result<Option<u64>>,
         content: impl AsyncFnOnce(u64) -> io::Result<Option<Body>>,
@@ -164,6 +167,7 @@ impl OutgoingFile<'_> {
             let reason = format!("it has {stated} of {} bytes", length - begin);
             return Err(failed(io::Error::other(reason)).into());
         }
+        let content = content.into_data_stream().map(move |piece| (piece, &slot).0);
         let stored = StoredBytes::new(name, length - begin);
         // The rest of a file has no digest: a client that goes on with a file has to compare all of
         // it.
@@ -171,7 +175,7 @@ impl OutgoingFile<'_> {
             Some(sha256) => stored.with_sha256(sha256),
             None => stored,
         };
-        let mut answer = stored.checked(content).into_response();
+        let mut answer = stored.checked(Body::from_stream(content)).into_response();
         *answer.status_mut() = status;
         let mut set = |name, value: String| {
             if let Ok(value) = value.parse() {
@@ -310,9 +314,10 @@ mod tests {
     ) -> (StatusCode, String) {
         let folder = TempDir::new().unwrap();
         let sha256 = gleaner_trust::sha256(b"content");
-        let file = IncomingFile { name: "the file x", length: 7, sha256: sha256.as_str() };
+        let file = IncomingFile { name: "the file x", length: 7 };
         let (path, body) = (folder.path().join("x.part"), Body::from_stream(pieces));
-        let refused = file.receive_within(Duration::from_millis(20), path, body).await.unwrap_err();
+        let received = file.receive(sha256.as_str(), Duration::from_millis(20), path, body);
+        let refused = received.await.unwrap_err();
         assert_eq!(folder.path().read_dir().unwrap().count(), 0, "nothing of it stays");
         (refused.status(), refused.reason())
     }
@@ -389,7 +394,7 @@ mod tests {
     async fn a_store_that_states_another_length_is_refused_before_an_answer_begins() {
         let file = OutgoingFile { name: "the file x", kind: OCTETS, help: "", sha256: None };
         let content = async |_| Ok(Some(Body::from("other")));
-        let refused = file.send(&HeaderMap::new(), Ok(Some(7)), content).await.unwrap_err();
+        let refused = file.send((), &HeaderMap::new(), Ok(Some(7)), content).await.unwrap_err();
         assert_eq!(refused.reason(), "cannot send the file x: it has 5 of 7 bytes");
     }
 }

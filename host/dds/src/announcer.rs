@@ -18,6 +18,7 @@ use std::io;
 use std::net::{IpAddr, Ipv4Addr, SocketAddrV4, UdpSocket};
 use std::time::{Duration, Instant};
 
+use gleaner_protocol::ingress::DISCOVERY_GROUP;
 use nix::ifaddrs::getifaddrs;
 use nix::net::if_::InterfaceFlags;
 use socket2::SockRef;
@@ -26,8 +27,6 @@ use tracing::debug;
 use super::filter::Prefix;
 use super::sockets::port_of_samples;
 
-/// The group of RTPS for discovery.
-const GROUP: Ipv4Addr = Ipv4Addr::new(239, 255, 0, 1);
 /// The participants of this machine whose ports are tried, and to which RustDDS sends in any case:
 /// the last ones of twelve, as participants take the first free ones.
 const INDICES: std::ops::RangeInclusive<u16> = 8..=11;
@@ -102,7 +101,7 @@ impl Announcer {
             debug!(%error, "announcements are not repeated");
             Vec::new()
         });
-        let group = SocketAddrV4::new(GROUP, port_of_samples(domain) - 1);
+        let group = SocketAddrV4::new(DISCOVERY_GROUP, port_of_samples(domain) - 1);
         let (from, next) = (Instant::now(), 0);
         Self { announcements, announcement: None, own, group, senders, from, next }
     }

@@ -40,28 +40,27 @@ fn disposed(submessage: &[u8]) -> Option<&[u8]> {
     is_it.then(|| &submessage[GUID_AT..GUID_AT + 16])
 }
 
-/// Returns the datagram with a key hash in each dispose; `None` if it has none that lacks it.
+/// Returns the datagram with a key hash in each dispose; `None`, and nothing is copied, if it has
+/// none that lacks it.
 fn with_key_hashes(datagram: &[u8]) -> Option<Vec<u8>> {
     if !datagram.starts_with(b"RTPS") {
         return None;
     }
-    let (header, mut rest) = datagram.split_at_checked(HEADER)?;
-    let mut changed = header.to_vec();
-    while let [_, _, low, high, ..] = rest {
-        let length = 4 + usize::from(u16::from_le_bytes([*low, *high]));
-        let Some((submessage, next)) = rest.split_at_checked(length) else { break };
-        match disposed(submessage) {
-            Some(guid) => {
-                let (begin, qos) = (&submessage[4..QOS_AT], &submessage[QOS_AT..]);
-                let parts = [&BEGIN[..2], &CHANGED_LENGTH, begin, &KEY_HASH, guid, qos];
-                changed.extend(parts.concat());
-            }
-            None => changed.extend_from_slice(submessage),
+    let (mut changed, mut copied, mut at) = (Vec::new(), 0, HEADER);
+    while let Some([_, _, low, high]) = datagram.get(at..at + 4) {
+        let end = at + 4 + usize::from(u16::from_le_bytes([*low, *high]));
+        let Some(submessage) = datagram.get(at..end) else { break };
+        if let Some(guid) = disposed(submessage) {
+            let (begin, qos) = (&submessage[4..QOS_AT], &submessage[QOS_AT..]);
+            let before = &datagram[copied..at];
+            let parts = [before, &BEGIN[..2], &CHANGED_LENGTH, begin, &KEY_HASH, guid, qos];
+            changed.extend(parts.concat());
+            copied = end;
         }
-        rest = next;
+        at = end;
     }
-    changed.extend_from_slice(rest);
-    (changed.len() > datagram.len()).then_some(changed)
+    changed.extend_from_slice(datagram.get(copied..).filter(|_| copied > 0)?);
+    Some(changed)
 }
 
 /// Replaces libc's function of this name.

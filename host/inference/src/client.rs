@@ -11,6 +11,7 @@ use gleaner_protocol::inference::{
 use gleaner_protocol::link::{Incoming, LinkError};
 use tracing::warn;
 
+use crate::loader::PassedModel;
 use crate::region::TensorRegion;
 use crate::sessions::{SessionId, SessionKey};
 
@@ -59,6 +60,7 @@ pub(crate) struct ConnectedLambda {
     pub(crate) memory: u64,
     socket: ModelSocket,
     models: HashMap<String, GrantedSession>,
+    pub(crate) files: Vec<PassedModel>,
     /// Names of the models that it has opened.
     pub(crate) opened: HashSet<String>,
     pub(crate) call: Option<OpenCall>,
@@ -72,7 +74,7 @@ pub(crate) struct ConnectedLambda {
 }
 
 impl ConnectedLambda {
-    pub(crate) fn new(add: AddClient, socket: OwnedFd) -> Self {
+    pub(crate) fn new(add: AddClient, socket: OwnedFd, files: Vec<PassedModel>) -> Self {
         let granted = |model: GrantedModel| {
             let key = model.load();
             (model.name, GrantedSession { key, refused: model.refused })
@@ -83,6 +85,7 @@ impl ConnectedLambda {
             memory: add.memory.min(MAX_TENSOR_BYTES),
             socket: ModelSocket::new(socket),
             models: add.models.into_iter().map(granted).collect(),
+            files,
             opened: HashSet::new(),
             call: None,
             inputs: None,
@@ -100,7 +103,7 @@ impl ConnectedLambda {
 
     /// Returns whether it may use a session.
     pub(crate) fn uses(&self, key: &SessionKey) -> bool {
-        self.models.values().any(|granted| granted.key == *key)
+        self.models.values().any(|granted| granted.key == *key && granted.refused.is_none())
     }
 
     /// Returns whether it may send a message in this second.

@@ -16,8 +16,8 @@ use tracing::{error, info};
 use crate::client::{CallStage, ConnectedLambda, LambdaId, OpenCall};
 use crate::engine_error::EngineError;
 use crate::lambdas::{LambdaTable, ReadyDescriptors, TOO_MANY};
-use crate::loader::{LoadDone, LoadJob};
-use crate::loads::{LoadQueue, PassedFiles};
+use crate::loader::{LoadDone, LoadJob, PassedModel};
+use crate::loads::LoadQueue;
 use crate::places::check_inputs;
 use crate::schedule::{RunSchedule, WaitingRun};
 use crate::sessions::{LoadState, SessionTable};
@@ -39,7 +39,8 @@ pub(crate) struct InferenceEngine {
     threads: ModelThreads,
     reports: ReportSink,
     lambdas: LambdaTable,
-    files: PassedFiles,
+    /// The files of the next lambda.
+    files: Vec<PassedModel>,
     sessions: SessionTable,
     loads: LoadQueue,
     schedule: RunSchedule,
@@ -74,7 +75,7 @@ impl InferenceEngine {
             threads,
             reports,
             lambdas: LambdaTable::default(),
-            files: PassedFiles::default(),
+            files: Vec::new(),
             sessions: SessionTable::default(),
             loads: LoadQueue::default(),
             schedule: RunSchedule::default(),
@@ -166,19 +167,20 @@ impl InferenceEngine {
         loop {
             match control.poll() {
                 Ok(Incoming::Message(InferenceRequest::Model(model, file, entry))) => {
-                    self.files.add(model, file, entry);
+                    self.files.push(PassedModel::new(model, file, entry));
                 }
                 Ok(Incoming::Message(InferenceRequest::Client(add, socket))) => {
-                    self.schedule.allow(&add.id, add.demand);
-                    self.lambdas.add(add, socket);
+                    self.schedule.allow(&add, self.has_trials);
+                    self.lambdas.add(add, socket, std::mem::take(&mut self.files));
                 }
-                Ok(Incoming::Message(InferenceRequest::Tried(load, refused))) => {
-                    if let Some((job, _)) = self.trial.take_if(|(job, _)| job.key == load) {
+                Ok(Incoming::Message(InferenceRequest::Tried(load, refused, memory))) => {
+                    if let Some((mut job, _)) = self.trial.take_if(|(job, _)| job.key == load) {
                         let session = job.session;
-                        match refused {
+                        job.tried = Some(memory);
+                        match refused.or_else(|| self.loads.refusal(memory, &self.sessions)) {
                             Some(why) => {
                                 self.finish_load(LoadDone { session, loaded: Err(why) });
-                                // The starter knows for how long, and is asked again.
+                                // Another lambda may open it again.
                                 self.sessions.remove(session);
                             }
                             None => self.trial = Some((job, true)),
@@ -231,7 +233,7 @@ impl InferenceEngine {
         let key = granted.key.clone();
         let session = match self.sessions.find(&key) {
             Some(session) => Ok(session),
-            None => self.files.load(key, &self.lambdas, &mut self.sessions, &mut self.loads),
+            None => self.loads.push(key, id, &mut self.lambdas, &mut self.sessions),
         };
         let Some(lambda) = self.lambdas.get_mut(id) else { return };
         let (outputs, stage) = (0, CallStage::Loading);
@@ -273,14 +275,8 @@ impl InferenceEngine {
         match self.sessions.get(call.session).map(|session| &session.state) {
             Some(LoadState::Loading) => lambda.call = Some(call),
             Some(LoadState::Ready(ready)) => {
-                let opened = ModelResult::Opened {
-                    inputs: ready.inputs.clone(),
-                    outputs: ready.outputs.clone(),
-                    runtime: ready.runtime.clone(),
-                    metadata: ready.metadata.clone(),
-                };
                 lambda.opened.insert(call.model);
-                lambda.reply(call.id, Ok(opened), None, 0);
+                lambda.reply(call.id, Ok(ready.opened()), None, 0);
             }
             Some(LoadState::Failed(reason)) => {
                 lambda.fail(call.id, ModelFaultKind::Failed, reason.clone());
@@ -303,6 +299,7 @@ impl InferenceEngine {
             let message = format!("the manifest has no model `{model}`");
             return lambda.fail(call, ModelFaultKind::NoSuchModel, message);
         };
+        let threads = granted.key.threads.into();
         let session = self.sessions.find(&granted.key).filter(|_| lambda.opened.contains(&model));
         let state = session.and_then(|session| Some((session, self.sessions.get(session)?)));
         let Some((session, LoadState::Ready(ready))) = state.map(|(id, it)| (id, &it.state)) else {
@@ -317,7 +314,8 @@ impl InferenceEngine {
                 let stage = CallStage::Waiting;
                 lambda.call =
                     Some(OpenCall { id: call, deadline_ns, model, session, outputs, stage });
-                let run = WaitingRun { account: lambda.id.clone(), session, inputs: placed };
+                let (account, inputs) = (lambda.id.clone(), placed);
+                let run = WaitingRun { account, session, threads, inputs };
                 self.schedule.push(id, deadline_ns, run);
             }
             Err(error) => {
@@ -372,6 +370,7 @@ impl InferenceEngine {
                     graph,
                     sha256: session.key.sha256.clone(),
                     path: session.path.clone(),
+                    held: ready.memory.held,
                     outputs: ready.outputs.clone(),
                     last: LastRun::default(),
                 };
@@ -384,8 +383,7 @@ impl InferenceEngine {
         for lambda in self.lambdas.with_call_on(id) {
             self.answer_open(lambda);
         }
-        let users = self.lambdas.users(&key);
-        if let Some(report) = self.sessions.report(id, users) {
+        if let Some(report) = self.sessions.report(id, self.lambdas.users(&key)) {
             (self.reports)(InferenceReport::Model(report));
         }
     }
@@ -433,10 +431,11 @@ impl InferenceEngine {
             (CallStage::Loading, Some(other)) => {
                 (ModelFaultKind::Queued, format!("waits for the load of {other}"))
             }
-            (CallStage::Loading, None) => (ModelFaultKind::TooSlow, "is still being loaded".into()),
-            (CallStage::Waiting, _) => {
-                (ModelFaultKind::TooSlow, "has not run yet: others run before it".into())
+            (CallStage::Loading, None) if self.trial.is_some() => {
+                (ModelFaultKind::Queued, "waits for the trial of its load".into())
             }
+            (CallStage::Loading, None) => (ModelFaultKind::TooSlow, "is still being loaded".into()),
+            (CallStage::Waiting, _) => self.schedule.cause_of_wait(&lambda.id, now),
             (CallStage::Running(_), _) => (ModelFaultKind::TooSlow, "is still running".into()),
         };
         let message = format!("model `{}` {state} at the deadline", call.model);

@@ -11,14 +11,15 @@ use rustix::io::Errno;
 use tracing::error;
 
 use crate::client::{CallStage, ConnectedLambda, LambdaId, OpenCall};
+use crate::loader::PassedModel;
 use crate::sessions::{SessionId, SessionKey};
 
 /// Most lambdas that are served at a time. Each has a socket and two regions.
 const LAMBDAS: usize = 512;
 
 /// The reason why calls of further lambdas fail.
-pub(crate) const TOO_MANY: &str = "gleaner-inference serves 512 lambdas, and this one came later: stop others, or start it in a \
-     `gleaner run` of its own";
+pub(crate) const TOO_MANY: &str = "gleaner-inference serves 512 lambdas, and this one came later: \
+                                   stop others, or start it in a `gleaner run` of its own";
 
 #[derive(Debug, Default)]
 pub(crate) struct LambdaTable {
@@ -35,12 +36,12 @@ pub(crate) struct ReadyDescriptors {
 }
 
 impl LambdaTable {
-    pub(crate) fn add(&mut self, add: AddClient, socket: OwnedFd) {
+    pub(crate) fn add(&mut self, add: AddClient, socket: OwnedFd, files: Vec<PassedModel>) {
         if self.lambdas.len() >= LAMBDAS {
             error!(lambda = add.name, "more than {LAMBDAS} lambdas: one is not served");
         }
         self.last_id += 1;
-        self.lambdas.insert(LambdaId(self.last_id), ConnectedLambda::new(add, socket));
+        self.lambdas.insert(LambdaId(self.last_id), ConnectedLambda::new(add, socket, files));
     }
 
     /// Returns whether a lambda is not served, as there are too many before it. It is once one of
@@ -160,7 +161,7 @@ mod tests {
         let mut table = LambdaTable::default();
         for _ in 0..=LAMBDAS {
             let add = AddClient { name: "many".to_owned(), ..AddClient::default() };
-            table.add(add, socket.try_clone().unwrap());
+            table.add(add, socket.try_clone().unwrap(), Vec::new());
         }
         let (first, last) = (LambdaId(1), LambdaId(LAMBDAS as u64 + 1));
         assert!(table.is_beyond(last) && !table.is_beyond(LambdaId(LAMBDAS as u64)));

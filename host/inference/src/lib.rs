@@ -4,7 +4,7 @@
 //!   never waits.
 //! - `client`, `lambdas`: a connected lambda, and all of them. `sessions`: models with their
 //!   options, shared by lambdas.
-//! - `schedule`, [`queue`]: the order of runs, and which ones run beside others.
+//! - `schedule`, [`queue`], `pace`: the order of runs, which ones run beside others, their rate.
 //!   `loads`: the order of loads, and their files. [`places`]: checks of requests.
 //! - `threads`, `loader`, `worker`: the thread that checks and loads models, and those that run
 //!   them. `running`: notes for the starter which model is in use, and the limits of time.
@@ -25,9 +25,11 @@ pub mod inspect;
 mod lambdas;
 mod loader;
 mod loads;
+mod memory;
 #[cfg(test)]
 #[path = "../tests/suite/onnx.rs"]
 mod onnx;
+mod pace;
 pub mod places;
 pub mod program;
 pub mod queue;

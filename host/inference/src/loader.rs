@@ -2,6 +2,7 @@
 
 use std::fs::File;
 use std::io;
+use std::os::fd::OwnedFd;
 use std::os::unix::fs::FileExt;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::PathBuf;
@@ -10,18 +11,42 @@ use std::time::{Duration, Instant};
 
 use gleaner_artifacts::{BuiltEngine, StoreLookup};
 use gleaner_base::{chain, hex};
-use gleaner_protocol::inference::{Element, MAX_TENSOR_BYTES, TensorInfo, engine_file};
+use gleaner_protocol::inference::{
+    Element, MAX_TENSOR_BYTES, ModelEngine, ModelFile, ModelMemory, TensorInfo, engine_file,
+};
 use sha2::{Digest, Sha256};
 
 use crate::backend::{
     Backends, ChosenGraph, EngineUse, ExecutionProvider, LoadedGraph, StopSignal, TensorValue,
 };
 use crate::inspect::{InspectError, ModelSignature, inspect};
+use crate::memory;
 use crate::running::{ModelWork, WorkNote};
 use crate::sessions::{ReadyModel, SessionId, SessionKey};
 
 /// The entry with the engine of a model, unverified; or the reason why it must not be used.
 pub(crate) type PassedEngine = Result<Option<Arc<File>>, String>;
+
+/// The file of a model, which its lambda keeps open.
+#[derive(Debug, Clone)]
+pub(crate) struct PassedModel {
+    pub(crate) sha256: String,
+    pub(crate) path: String,
+    pub(crate) file: Arc<File>,
+    pub(crate) engine: PassedEngine,
+}
+
+impl PassedModel {
+    pub(crate) fn new(model: ModelFile, file: OwnedFd, entry: Option<OwnedFd>) -> Self {
+        let ModelFile { sha256, path, engine } = model;
+        let entry = entry.map(|it| Arc::new(File::from(it)));
+        let engine = match engine {
+            ModelEngine::Refused(reason) => Err(reason),
+            ModelEngine::None | ModelEngine::Attached => Ok(entry),
+        };
+        Self { sha256, path, file: Arc::new(File::from(file)), engine }
+    }
+}
 
 pub(crate) struct LoadJob {
     pub(crate) session: SessionId,
@@ -30,6 +55,8 @@ pub(crate) struct LoadJob {
     pub(crate) engine: PassedEngine,
     pub(crate) path: String,
     pub(crate) lambdas: Vec<String>,
+    /// Memory that its trial took.
+    pub(crate) tried: Option<ModelMemory>,
 }
 
 pub(crate) struct LoadDone {
@@ -81,6 +108,7 @@ impl ModelLoader {
         self.note.begin(ModelWork {
             note: job.key.sha256.clone(),
             path: job.path.clone(),
+            held: 0,
             lambdas: job.lambdas.clone(),
             until: Instant::now() + limit,
             limit,
@@ -97,7 +125,7 @@ impl ModelLoader {
         job: &LoadJob,
         stop: &StopSignal,
     ) -> Result<(Box<dyn LoadedGraph>, ReadyModel), ModelError> {
-        let start = Instant::now();
+        let (start, before) = (Instant::now(), memory::now());
         let model = read(&job.file, &job.key.sha256, self.limits.model_max)?;
         let signature = inspect(&model)?;
         let key = &job.key;
@@ -130,7 +158,16 @@ impl ModelLoader {
         });
         let outputs = outputs.collect();
         let load_ns = u64::try_from(start.elapsed().as_nanos()).unwrap_or(u64::MAX);
-        Ok((graph, ReadyModel { inputs, outputs, metadata, runtime, reason, built_for, load_ns }))
+        let has_gpu = [", cuda,", ", tensorrt,"].iter().any(|provider| runtime.contains(provider));
+        let taken = memory::taken_since(before);
+        let memory = match job.tried {
+            _ if has_gpu => memory::without_libraries(taken.held),
+            Some(tried) => tried,
+            None => taken,
+        };
+        let ready =
+            ReadyModel { inputs, outputs, metadata, runtime, reason, built_for, load_ns, memory };
+        Ok((graph, ready))
     }
 
     /// Returns what to do about an engine, if TensorRT is to load the model.

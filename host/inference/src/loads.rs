@@ -1,16 +1,12 @@
-//! The order of loads, one at a time: the earliest deadline first; and the files of models that the
-//! starter has passed.
+//! The order of loads, one at a time: the earliest deadline first.
 
-use std::collections::HashMap;
-use std::fs::File;
-use std::os::fd::OwnedFd;
-use std::sync::Arc;
+use gleaner_protocol::inference::ModelMemory;
 
-use gleaner_protocol::inference::{ModelEngine, ModelFile};
-
+use crate::client::LambdaId;
 use crate::engine_error::quoted;
 use crate::lambdas::LambdaTable;
-use crate::loader::{LoadJob, PassedEngine};
+use crate::loader::{LoadJob, PassedModel};
+use crate::memory;
 use crate::sessions::{SessionId, SessionKey, SessionTable};
 
 /// The models that wait to be loaded, and the one that is being loaded.
@@ -27,8 +23,23 @@ struct CurrentLoad {
 }
 
 impl LoadQueue {
-    pub(crate) fn push(&mut self, job: LoadJob) {
-        self.waiting.push(job);
+    /// Adds a session, and its load with the file of the lambda `id`.
+    pub(crate) fn push(
+        &mut self,
+        key: SessionKey,
+        id: LambdaId,
+        lambdas: &mut LambdaTable,
+        sessions: &mut SessionTable,
+    ) -> Result<SessionId, String> {
+        let files = lambdas.get_mut(id).map(|lambda| &lambda.files);
+        let file = files.and_then(|it| it.iter().find(|file| file.sha256 == key.sha256)).cloned();
+        let Some(PassedModel { path, file, engine, .. }) = file else {
+            return Err(format!("the starter passed no file with the digest {}", key.sha256));
+        };
+        let session = sessions.add(key.clone(), path.clone());
+        let lambdas = lambdas.users(&key);
+        self.waiting.push(LoadJob { session, key, file, engine, path, lambdas, tried: None });
+        Ok(session)
     }
 
     /// Begins the next load, if none is in progress. A model that no lambda waits for any more is
@@ -68,49 +79,14 @@ impl LoadQueue {
         self.current = None;
     }
 
+    /// Returns why the load that has begun must not happen, if it takes the memory `asked`.
+    pub(crate) fn refusal(&self, asked: ModelMemory, sessions: &SessionTable) -> Option<String> {
+        let why = memory::refusal(asked, &sessions.loaded())?;
+        Some(format!("model {}: {why}", self.current.as_ref()?.name))
+    }
+
     /// Returns the model that is being loaded, with its lambdas, if it is another one.
     pub(crate) fn other_than(&self, session: SessionId) -> Option<&str> {
         self.current.as_ref().filter(|load| load.session != session).map(|load| &*load.name)
-    }
-}
-
-/// The files, by their digests.
-#[derive(Default)]
-pub(crate) struct PassedFiles(HashMap<String, PassedModel>);
-
-struct PassedModel {
-    path: String,
-    file: Arc<File>,
-    engine: PassedEngine,
-}
-
-impl PassedFiles {
-    pub(crate) fn add(&mut self, model: ModelFile, file: OwnedFd, entry: Option<OwnedFd>) {
-        let ModelFile { sha256, path, engine } = model;
-        let entry = entry.map(|it| Arc::new(File::from(it)));
-        let engine = match engine {
-            ModelEngine::Refused(reason) => Err(reason),
-            ModelEngine::None | ModelEngine::Attached => Ok(entry),
-        };
-        let file = Arc::new(File::from(file));
-        self.0.insert(sha256, PassedModel { path, file, engine });
-    }
-
-    /// Adds a session, and its load to `loads`.
-    pub(crate) fn load(
-        &self,
-        key: SessionKey,
-        lambdas: &LambdaTable,
-        sessions: &mut SessionTable,
-        loads: &mut LoadQueue,
-    ) -> Result<SessionId, String> {
-        let Some(PassedModel { path, file, engine }) = self.0.get(&key.sha256) else {
-            return Err(format!("the starter passed no file with the digest {}", key.sha256));
-        };
-        let (path, file, engine) = (path.clone(), Arc::clone(file), engine.clone());
-        let session = sessions.add(key.clone(), path.clone());
-        let lambdas = lambdas.users(&key);
-        loads.push(LoadJob { session, key, file, engine, path, lambdas });
-        Ok(session)
     }
 }

@@ -59,9 +59,9 @@ impl<O: Copy + Eq + Hash, T> FairQueue<O, T> {
         Some((owner, self.remove(owner)?))
     }
 
-    /// Returns whether no entry waits.
-    pub fn is_empty(&self) -> bool {
-        self.waiting.is_empty()
+    /// Returns the waiting entries.
+    pub fn entries(&self) -> impl Iterator<Item = &T> {
+        self.waiting.iter().map(|waiting| &waiting.entry)
     }
 }
 

@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 use gleaner_protocol::inference::NOTE_BYTES;
 
 use crate::backend::StopSignal;
+use crate::memory;
 
 /// Time for an overdue run to end after its backend was notified.
 const STOP_TIMEOUT: Duration = Duration::from_secs(5);
@@ -18,6 +19,8 @@ pub(crate) struct ModelWork {
     /// SHA-256 of the file, and while it runs, a space and the identity of the lambda.
     pub(crate) note: String,
     pub(crate) path: String,
+    /// Memory that the model has taken already, in bytes.
+    pub(crate) held: u64,
     /// Names of the lambdas that requested it.
     pub(crate) lambdas: Vec<String>,
     /// Time at which it is overdue.
@@ -44,7 +47,8 @@ impl WorkNote {
     }
 
     pub(crate) fn begin(&self, work: ModelWork) {
-        self.write(&work.note);
+        let is_short = memory::is_short(memory::RUN_PART, work.held);
+        self.write(&if is_short { work.note.clone() + "\n" } else { work.note.clone() });
         *self.lock() = Some(work);
     }
 
@@ -112,6 +116,7 @@ mod tests {
         let work = |note: &str| ModelWork {
             note: note.to_owned(),
             path: String::new(),
+            held: 0,
             lambdas: Vec::new(),
             until: now + limit,
             limit,

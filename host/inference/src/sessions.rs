@@ -5,9 +5,12 @@
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-use gleaner_protocol::inference::{LoadedModel, ModelState, TensorInfo};
+use gleaner_protocol::inference::{LoadedModel, ModelMemory, ModelResult, ModelState, TensorInfo};
 
-/// Time for which a session without lambdas is kept: a lambda that is restarted finds it loaded.
+use crate::memory;
+
+/// Time for which a session without lambdas is kept, while there is memory: a lambda that is
+/// restarted finds it loaded.
 const KEPT: Duration = Duration::from_secs(60);
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -36,6 +39,14 @@ pub(crate) struct ReadyModel {
     pub(crate) built_for: Option<String>,
     /// Time to load it and to run it once, in ns.
     pub(crate) load_ns: u64,
+    pub(crate) memory: ModelMemory,
+}
+
+impl ReadyModel {
+    pub(crate) fn opened(&self) -> ModelResult {
+        let Self { inputs, outputs, runtime, metadata, .. } = self.clone();
+        ModelResult::Opened { inputs, outputs, runtime, metadata }
+    }
 }
 
 /// A model with its options.
@@ -95,6 +106,15 @@ impl SessionTable {
         self.sessions.remove(&id);
     }
 
+    /// Returns the paths and the memory of the models that are loaded.
+    pub(crate) fn loaded(&self) -> Vec<(&str, ModelMemory)> {
+        let loaded = self.sessions.values().filter_map(|session| match &session.state {
+            LoadState::Ready(ready) => Some((&*session.path, ready.memory)),
+            _ => None,
+        });
+        loaded.collect()
+    }
+
     pub(crate) fn count_failed(&mut self, id: SessionId) {
         if let Some(session) = self.get_mut(id) {
             session.counts.failed += 1;
@@ -108,11 +128,12 @@ impl SessionTable {
         is_used: impl Fn(&SessionKey) -> bool,
         now: Instant,
     ) -> Vec<SessionId> {
+        let kept = if memory::is_short(2, 0) { Duration::ZERO } else { KEPT };
         let mut removed = Vec::new();
         for (id, session) in &mut self.sessions {
             if is_used(&session.key) || matches!(session.state, LoadState::Loading) {
                 session.unused_since = None;
-            } else if *session.unused_since.get_or_insert(now) + KEPT <= now {
+            } else if *session.unused_since.get_or_insert(now) + kept <= now {
                 removed.push(*id);
             }
         }
@@ -132,11 +153,11 @@ impl SessionTable {
 impl ModelSession {
     fn report(&self, lambdas: Vec<String>) -> LoadedModel {
         let counts = self.counts;
-        let mut built_for = None;
+        let (mut built_for, mut memory) = (None, ModelMemory::default());
         let (state, runtime, reason, load_ns) = match &self.state {
             LoadState::Loading => (ModelState::Warming, "", "", 0),
             LoadState::Ready(ready) => {
-                built_for = ready.built_for.clone();
+                (built_for, memory) = (ready.built_for.clone(), ready.memory);
                 (ModelState::Ready, &*ready.runtime, &*ready.reason, ready.load_ns)
             }
             LoadState::Failed(reason) => (ModelState::Failed, "", &**reason, 0),
@@ -156,6 +177,7 @@ impl ModelSession {
             shared: counts.shared,
             failed: counts.failed,
             run_ns: counts.run_ns,
+            memory,
         }
     }
 }

@@ -12,6 +12,7 @@ use gleaner_protocol::inference::{Element, ModelFault, ModelFaultKind, TensorInf
 
 use crate::backend::{LoadedGraph, StopSignal, TensorValue};
 use crate::loader::caught;
+use crate::memory;
 use crate::places::{PlacedInput, place_outputs};
 use crate::region::TensorRegion;
 use crate::running::{ModelWork, WorkNote};
@@ -28,6 +29,8 @@ pub(crate) struct WorkerModel {
     pub(crate) graph: Box<dyn LoadedGraph>,
     pub(crate) sha256: String,
     pub(crate) path: String,
+    /// Memory that it took when it was loaded, in bytes.
+    pub(crate) held: u64,
     pub(crate) outputs: Vec<TensorInfo>,
     pub(crate) last: LastRun,
 }
@@ -101,6 +104,7 @@ impl ModelWorker {
         self.note.begin(ModelWork {
             note: format!("{} {id}", model.sha256),
             path: model.path.clone(),
+            held: model.held,
             lambdas: vec![name.clone()],
             until: Instant::now() + limit,
             limit,
@@ -146,7 +150,12 @@ impl WorkerModel {
             // The lambda may use the region for its next request.
             return (Err(failed("nothing waits for the result")), ran_ns);
         }
-        (last.write(&self.outputs, job), ran_ns)
+        let written = last.write(&self.outputs, job);
+        if written.is_err() || memory::is_short(2, 0) {
+            // Others may need it before the next run.
+            self.last = LastRun::default();
+        }
+        (written, ran_ns)
     }
 }
 
@@ -271,6 +280,7 @@ mod tests {
             graph: Box::new(Echo),
             sha256: key.sha256,
             path: "m.onnx".to_owned(),
+            held: 0,
             outputs: vec![info],
             last: LastRun::default(),
         };

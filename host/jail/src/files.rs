@@ -1,6 +1,7 @@
 //! Restricts the files that a process can open, and TCP, signals and abstract sockets, by Landlock,
 //! for this thread and its descendants.
 
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use gleaner_protocol::Layer;
@@ -10,7 +11,7 @@ use landlock::{
     path_beneath_rules,
 };
 
-use crate::JailError;
+use crate::{JailError, needed};
 
 /// The name of this layer.
 pub const NAME: &str = "files";
@@ -157,7 +158,12 @@ fn layer(name: &str, what: &str, restricted: Result<RestrictionStatus, JailError
     };
     match (status.ruleset, status.landlock) {
         (RulesetStatus::NotEnforced, LandlockStatus::NotImplemented) => {
-            Layer::no(name, "this kernel has no Landlock; it came with Linux 5.13")
+            match needed::refusal(libc::SYS_landlock_create_ruleset) {
+                Some(error) if error.kind() != ErrorKind::Unsupported => {
+                    Layer::no(name, format!("a filter refuses Landlock: {error}"))
+                }
+                _ => Layer::no(name, "this kernel has no Landlock; it came with Linux 5.13"),
+            }
         }
         (RulesetStatus::NotEnforced, _) => {
             Layer::no(name, "Landlock is not switched on; add it to the kernel's parameter lsm=")

@@ -12,6 +12,7 @@
 //! A compiler of a lambda whose author is not trusted enters [`compiler`] instead. [`ingress`],
 //! [`recorder`] and [`inference`] are the sandboxes of the processes that serve all lambdas.
 //!
+//! [`needed`] tries before all the calls without which a start fails.
 //! [`self_test`] then tries what should be denied: a layer counts only if it was seen to deny it.
 //! [`cgroup`] is the supervisor's side, for memory and processes that a lambda starts. A layer that
 //! the system lacks is reported, and users can read which layers exist. Without one of
@@ -28,6 +29,7 @@ mod filter;
 pub mod inference;
 pub mod ingress;
 pub mod memory;
+pub mod needed;
 mod own_memory;
 pub mod priority;
 pub mod recorder;

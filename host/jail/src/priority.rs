@@ -1,16 +1,16 @@
-//! Gives up the real-time priority that a process has from its starter.
+//! Gives up the real-time priority that a process has from its starter, for the CPU and for disks.
 #![allow(unsafe_code)]
 
 use std::io;
 
 use libc::c_long;
 
-/// Gives this thread, and those that it starts from now on, the priority of usual programs, if it
-/// has that of real time. Its nice value stays.
+/// Gives this thread, and those that it starts from now on, the priorities of usual programs, if it
+/// has those of real time (`chrt`, `ionice -c 1`). Its nice value stays.
 ///
 /// # Errors
 ///
-/// Those of `sched_setscheduler`, which only a filter of a container refuses here.
+/// Those of the calls, which only a filter of a container refuses here.
 pub fn leave_real_time() -> io::Result<()> {
     let usual = libc::sched_param { sched_priority: 0 };
     // The functions of musl do nothing.
@@ -22,6 +22,11 @@ pub fn leave_real_time() -> io::Result<()> {
         if real_time.into_iter().any(|it| policy - reset == c_long::from(it)) {
             let policy = c_long::from(libc::SCHED_OTHER) | reset;
             succeeds(libc::syscall(libc::SYS_sched_setscheduler, 0, policy, &raw const usual))?;
+        }
+        // Of threads (1), this one (0): class 1, at bit 13, is that of real time. Kernels without
+        // the call have no classes.
+        if libc::syscall(libc::SYS_ioprio_get, 1, 0) >> 13 == 1 {
+            succeeds(libc::syscall(libc::SYS_ioprio_set, 1, 0, 0))?;
         }
     }
     Ok(())

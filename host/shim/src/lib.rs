@@ -30,10 +30,9 @@ use std::time::Duration;
 use clap::Parser;
 use gleaner_base::{ByteSize, Exit, Failure};
 use gleaner_jail::cgroup::{CgroupLimits, Group};
-use gleaner_jail::{Paths, base_filter, cgroup, files, memory, sandbox_filter, self_test, sockets};
-use gleaner_protocol::{
-    ExitRecord, LAYERS_ENV, Layer, ProcessOrigin, REQUIRED_HELP, RESULTS_ENV, SHIM_ENV,
-};
+use gleaner_jail::{Paths, base_filter, cgroup, files, memory, needed, sandbox_filter};
+use gleaner_jail::{self_test, sockets};
+use gleaner_protocol::{ExitRecord, LAYERS_ENV, Layer, ProcessOrigin, RESULTS_ENV, SHIM_ENV};
 use gleaner_vitals::{PULSE_ENV, Pulse, make_inheritable};
 
 use self::results::{BUDGET, ResultFiles, ResultSpool, Results};
@@ -81,6 +80,9 @@ struct Args {
     /// Limit of processes and threads of the control group.
     #[arg(long, value_name = "N", default_value_t = 512)]
     cgroup_tasks: u64,
+    /// Start the runtime also without a required layer, as WebAssembly confines its lambda.
+    #[arg(long)]
+    component: bool,
     /// Start nothing: set up every layer in this process, verify each, and print them as JSON.
     #[arg(long, conflicts_with = "program")]
     layers: bool,
@@ -134,6 +136,7 @@ pub fn main() -> ExitCode {
 fn run(args: &Args) -> Result<ExitCode, Failure> {
     let cannot =
         |what: &str, error: &dyn std::error::Error| Failure::caused_by(Exit::Internal, what, error);
+    refuse_without_required(args, needed::refused().as_slice())?;
     let signals =
         Signals::register().map_err(|error| cannot("cannot register for signals", &error))?;
     if let Some(starter) = args.starter {
@@ -154,7 +157,7 @@ fn run(args: &Args) -> Result<ExitCode, Failure> {
     layers.extend([sockets::deny(), hard_deadline()]);
     let (group, layer) = create_cgroup(args);
     layers.push(layer);
-    refuse_without_required(&layers)?;
+    refuse_without_required(args, &layers)?;
     let layers = serde_json::to_string(&layers).expect("layers are plain data");
     let (program, arguments) = args.program.split_first().expect("clap requires a program");
     let mut command = Command::new(program);
@@ -272,12 +275,18 @@ fn exit_like(record: &ExitRecord) -> ExitCode {
     u8::try_from(record.code.unwrap_or(1)).unwrap_or(1).into()
 }
 
-/// Returns a failure if no lambda may run, as one of `layers` is missing.
-fn refuse_without_required(layers: &[Layer]) -> Result<(), Failure> {
+/// Returns a failure if no lambda may run, as one of `layers` is missing; a component does, with a
+/// warning.
+fn refuse_without_required(args: &Args, layers: &[Layer]) -> Result<(), Failure> {
     let Some(missing) = layers.iter().find(|layer| layer.prevents_lambdas()) else { return Ok(()) };
-    let message = format!("this machine cannot sandbox a lambda: `{}` does not hold", missing.name);
+    let Layer { name, note, .. } = missing;
+    if args.component {
+        eprintln!("warning: only WebAssembly confines the lambda: `{name}` does not hold: {note}");
+        return Ok(());
+    }
+    let message = format!("this machine cannot sandbox a lambda: `{name}` does not hold");
     let failure = Failure::new(Exit::Internal, message);
-    Err(Failure { causes: vec![missing.note.clone()], ..failure }.with_help(REQUIRED_HELP))
+    Err(Failure { causes: vec![note.clone()], ..failure }.with_help(missing.help()))
 }
 
 fn hard_deadline() -> Layer {
@@ -301,7 +310,8 @@ fn create_cgroup(args: &Args) -> (Option<Group>, Layer) {
 
 /// Prints the layers that hold on this machine: each is set up in this process and verified.
 fn show_layers(args: &Args) -> Result<ExitCode, Failure> {
-    let mut layers = base_filter::apply();
+    let mut layers = Vec::from_iter(needed::refused());
+    layers.extend(base_filter::apply());
     layers.push(sockets::deny());
     let cannot_watch =
         |error: std::io::Error| Layer::no(HARD_DEADLINE, format!("no pulse page: {error}"));

@@ -266,7 +266,7 @@ fn demand() -> Section {
     ];
     let note = "What the lambda needs in its busiest minute, on average over its wakes.\n\
                 A vehicle admits it by these numbers ([a vehicle](vehicle.md#admission)); \
-                they limit nothing.\n\
+                they limit only [models](models.md).\n\
                 Without one, the vehicle uses what it has measured, and before that an assumption.";
     Section { title: "[demand]", note: note.to_owned(), keys }
 }

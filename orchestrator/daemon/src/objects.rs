@@ -36,13 +36,13 @@ pub(crate) async fn receive<E: Error + Send + Sync + 'static>(
     let (file, part) = begin_object(&path).map_err(failed)?;
     let part = UnfinishedFile(part);
     let mut file = tokio::fs::File::from_std(file);
-    let mut announced = AnnouncedFile::new(length, wanted.as_str());
+    let mut announced = AnnouncedFile::new(length);
     while let Some(piece) = pieces.next().await {
         let piece = piece.map_err(|error| failed(io::Error::other(error)))?;
         announced.add(&piece).map_err(refused)?;
         file.write_all(&piece).await.map_err(failed)?;
     }
-    announced.finish().map_err(refused)?;
+    announced.finish(wanted.as_str()).map_err(refused)?;
     // The last write goes on in the background, and only this returns its error.
     file.flush().await.map_err(failed)?;
     file.sync_all().await.map_err(failed)?;

@@ -98,12 +98,15 @@ fn waiting(
     let storage = spools.open(name)?;
     let released = storage.released()?;
     let note = storage.noted()?.ok_or("its writer, of an earlier version, notes nothing")?;
-    let records = note.lost + note.pending;
-    let loss = (records > 0).then(|| StreamLoss {
+    let waiting = if note.failing_ns == 0 { 0 } else { note.queued };
+    let records = note.lost + note.pending + note.queued - waiting;
+    let loss = (records > 0 || waiting > 0).then(|| StreamLoss {
         stream: name.to_owned(),
         records,
         reason: note.reason.map(|reason| format!("{reason:?}")).unwrap_or_default(),
         last_ns: note.lost_ns,
+        waiting,
+        failing_ns: note.failing_ns,
     });
     // Those that the budget has removed are lost, and in a gap.
     Ok((note.durable.saturating_sub(released.max(note.removed)), loss))
@@ -129,7 +132,9 @@ pub(crate) fn collect(lambdas: &Path, kept: &BTreeSet<String>) -> Vec<String> {
 mod tests {
     use std::num::NonZeroU8;
 
-    use gleaner_spool::{BUDGET_MIN, BootId, SpoolConfig, SpoolTime, SpoolWriter};
+    use gleaner_spool::{
+        BUDGET_MIN, BootId, GapReason, SpoolConfig, SpoolNote, SpoolTime, SpoolWriter,
+    };
 
     use super::*;
 
@@ -149,10 +154,28 @@ mod tests {
         }
         spools.open("events").unwrap().release(2).unwrap();
         assert_eq!(count(&spools), SpoolCounts { unsent: 6, ..SpoolCounts::default() });
-        // As an earlier version has left it.
-        fs::remove_file(folder.path().join("events/note")).unwrap();
+        // On a full disk, two were refused, and four wait.
+        let (stream, reason) = ("lambdas/brake".to_owned(), Some(GapReason::DiskFull));
+        let times = SpoolNote { queued: 4, failing_ns: 5, lost_ns: 8, ..SpoolNote::default() };
+        let note = SpoolNote { durable: 3, next: 99, lost: 1, pending: 2, reason, ..times };
+        spools.open(&stream).unwrap().note(&note).unwrap();
+        let (reason, last_ns, failing_ns) = ("DiskFull".to_owned(), 8, 5);
+        let loss = StreamLoss { stream, records: 3, reason, last_ns, waiting: 4, failing_ns };
+        let lost = vec![loss.clone()];
+        assert_eq!(count(&spools), SpoolCounts { unsent: 6, uncounted: 0, lost });
+        // As the version before notes it, with numbers 3 to 8 and the CRC-32 of zlib.
+        let numbers = [3_u64, 9, 0, 1, 2, 8].map(u64::to_le_bytes).concat();
+        let note = [&numbers[..], &[2, 1, 225, 63, 40, 84]].concat();
+        fs::write(folder.path().join("lambdas/brake/note"), note).unwrap();
+        let loss = StreamLoss { failing_ns: 8, ..loss };
+        assert_eq!(count(&spools).lost, std::slice::from_ref(&loss));
         fs::write(folder.path().join("lambdas/odd"), "no folder").unwrap();
-        assert_eq!(count(&spools), SpoolCounts { unsent: 3, uncounted: 2, lost: vec![] });
+        // Of changed bytes; then as an earlier version has left it.
+        let file = folder.path().join("events/note");
+        fs::write(&file, [1; 69]).unwrap();
+        assert_eq!(count(&spools).uncounted, 2);
+        fs::remove_file(file).unwrap();
+        assert_eq!(count(&spools), SpoolCounts { unsent: 3, uncounted: 2, lost: vec![loss] });
     }
 
     #[test]

@@ -11,15 +11,14 @@ pub const LAYERS_ENV: &str = "GLEANER_LAYERS";
 /// The environment variable in which `gleaner-shim` passes its process id to its runtime.
 pub const SHIM_ENV: &str = "GLEANER_SHIM";
 
+/// The name of the layer of a system that refuses a call without which no lambda starts.
+pub const NEEDED_CALLS: &str = "needed calls";
+
 /// The layers without which `gleaner-shim` starts no lambda. A lambda without the first two could
 /// open sockets and act on other processes; one with the third, a priority that cannot be given up,
-/// could take a core for itself.
-pub const REQUIRED_LAYERS: [&str; 3] = ["system calls", "sockets", "real-time priority"];
-
-/// The way out if one of [`REQUIRED_LAYERS`] is missing.
-pub const REQUIRED_HELP: &str = "let the kernel or the container permit the system call \
-    `seccomp`, as with `docker run --security-opt seccomp=PROFILE`; `gleaner doctor` names what is \
-    missing";
+/// could take a core for itself. Without the last one, its start would fail.
+pub const REQUIRED_LAYERS: [&str; 4] =
+    ["system calls", "sockets", "real-time priority", NEEDED_CALLS];
 
 /// A layer of isolation around a lambda's process, as tested on this machine.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -48,6 +47,27 @@ impl Layer {
     /// Returns whether no lambda may run, as this layer is missing.
     pub fn prevents_lambdas(&self) -> bool {
         self.holds == Holds::No && REQUIRED_LAYERS.contains(&&*self.name)
+    }
+
+    /// Returns the way out if this layer is missing: of the kernel, and of a container.
+    pub fn help(&self) -> &'static str {
+        match &*self.name {
+            "system calls" | "sockets" => {
+                "it needs CONFIG_SECCOMP_FILTER=y, and a container that permits `seccomp`, as with \
+                 `docker run --security-opt seccomp=PROFILE`"
+            }
+            "real-time priority" => "permit the call, or start Gleaner without `chrt` and `ionice`",
+            NEEDED_CALLS => "permit them: `docker run --security-opt seccomp=PROFILE`",
+            "files" if self.holds == Holds::Partly => {
+                "a newer kernel restricts more; see docs/security.md"
+            }
+            "files" => {
+                "it needs CONFIG_SECURITY_LANDLOCK=y, `landlock` in the kernel's parameter lsm=, \
+                 and a container that permits `landlock_create_ruleset`"
+            }
+            "control group" => "delegate one (systemd: `Delegate=cpu memory pids`): --cgroup DIR",
+            _ => "Python lambdas are isolated by fewer layers; see docs/security.md",
+        }
     }
 
     /// Creates a layer that holds.

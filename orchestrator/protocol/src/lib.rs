@@ -30,7 +30,7 @@ pub use drive_info::{DriveInfo, DriveTopicInfo, PictureInfo};
 pub use drive_time::{DriveTime, DriveTimeError};
 pub use exit_record::{ExitRecord, KillReason, Killed, Phase, SHUTDOWN_TIMEOUT};
 pub use handover::{Handover, HandoverReceiver, PASSES_INFERENCE};
-pub use isolation::{Holds, LAYERS_ENV, Layer, REQUIRED_HELP, REQUIRED_LAYERS, SHIM_ENV};
+pub use isolation::{Holds, LAYERS_ENV, Layer, NEEDED_CALLS, REQUIRED_LAYERS, SHIM_ENV};
 pub use live_status::{
     DurationStats, LinkLosses, LiveStatus, LiveTopic, NetworkStatus, ReceptionGaps, WakeCounts,
 };

@@ -41,7 +41,8 @@ pub struct VehicleStatus {
     /// Number of events of the orchestrator that could not be made durable.
     #[serde(default)]
     pub events_lost: u64,
-    /// Losses of streams whose records could not be written, also before a kill or a power cut.
+    /// Losses of streams whose records could not be written, also before a kill or a power cut, and
+    /// streams whose records cannot be written now.
     #[serde(default)]
     pub records_lost: Vec<StreamLoss>,
     /// The processes; absent while the supervisor cannot be reached.
@@ -153,6 +154,12 @@ pub struct StreamLoss {
     pub reason: String,
     /// Time of the last loss, in ns since 1970, as the clock was set.
     pub last_ns: i64,
+    /// Number of further records that wait for the disk, as writing fails.
+    #[serde(default, alias = "unwritten")]
+    pub waiting: u64,
+    /// Time since which writing fails, as `last_ns`; 0 if it does not.
+    #[serde(default)]
+    pub failing_ns: i64,
 }
 
 /// The status of a program.

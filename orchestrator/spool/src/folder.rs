@@ -10,7 +10,7 @@ use gleaner_base::safe_file::UnsafePath;
 use gleaner_base::sync_folder;
 use rustix::fs::{
     AtFlags, Dir, FileType, FlockOperation, Mode, OFlags, Stat, fchmod, flock, fstat, openat,
-    statat, unlinkat,
+    renameat, statat, unlinkat,
 };
 use rustix::io::Errno;
 
@@ -27,6 +27,9 @@ const RELEASED: &str = "released";
 /// Name of the file with the last note of the writer.
 const NOTE: &str = "note";
 
+/// Name of a segment before its first records are durable.
+const UNPUBLISHED: &str = "next";
+
 /// Permissions of the files in the folder.
 const MODE: Mode = Mode::RUSR.union(Mode::WUSR);
 
@@ -42,6 +45,8 @@ pub struct SpoolFolder {
     owner: u32,
     /// The locked file; `None` for a reader.
     lock: Option<File>,
+    /// The file of the note; `None` for a reader, and if a writer could not open it.
+    note: Option<File>,
 }
 
 impl SpoolFolder {
@@ -58,7 +63,7 @@ impl SpoolFolder {
         options.read(true).custom_flags(flags.bits().cast_signed());
         let opened = options.open(&path).and_then(|folder| Ok((folder.metadata()?.uid(), folder)));
         match opened {
-            Ok((owner, folder)) => Ok(SpoolFolder { path, folder, owner, lock: None }),
+            Ok((owner, folder)) => Ok(SpoolFolder { path, folder, owner, lock: None, note: None }),
             Err(source) => Err(SpoolError::Folder { path, source }),
         }
     }
@@ -89,6 +94,7 @@ impl SpoolFolder {
             other => other.map_err(|error| failed(error.into()))?,
         }
         folder.lock = Some(lock);
+        folder.note = folder.open_file(NOTE, OFlags::WRONLY | OFlags::CREATE).ok();
         Ok(folder)
     }
 
@@ -229,7 +235,7 @@ impl SpoolStorage for SpoolFolder {
         Ok(names)
     }
 
-    fn create(&self, first: u64) -> io::Result<File> {
+    fn create(&self) -> io::Result<File> {
         let Some(lock) = &self.lock else {
             let why = "the folder was opened for reading";
             return Err(io::Error::new(io::ErrorKind::PermissionDenied, why));
@@ -238,12 +244,15 @@ impl SpoolStorage for SpoolFolder {
             // Another writer may have the stream.
             return Err(io::Error::new(io::ErrorKind::NotFound, format!("`{LOCK}` was removed")));
         }
-        match self.remove(first) {
-            Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
+        match unlinkat(&self.folder, UNPUBLISHED, AtFlags::empty()) {
+            Err(error) if error != Errno::NOENT => return Err(error.into()),
             _ => {}
         }
-        let flags = OFlags::WRONLY | OFlags::CREATE | OFlags::EXCL;
-        self.open_file(&segment_name(first), flags)
+        self.open_file(UNPUBLISHED, OFlags::WRONLY | OFlags::CREATE | OFlags::EXCL)
+    }
+
+    fn publish(&self, first: u64) -> io::Result<()> {
+        Ok(renameat(&self.folder, UNPUBLISHED, &self.folder, segment_name(first))?)
     }
 
     fn open(&self, first: u64) -> io::Result<File> {
@@ -286,12 +295,16 @@ impl SpoolStorage for SpoolFolder {
         };
         let mut bytes = [0; NOTE_LEN];
         let mut read =
-            || file.read_exact_at(&mut bytes, 0).ok().and_then(|()| SpoolNote::parse(&bytes));
+            || FileExt::read_at(&file, &mut bytes, 0).ok().and_then(|_| SpoolNote::parse(&bytes));
         // Its writer may have been about to replace it.
         Ok(read().or_else(read))
     }
 
     fn note(&self, note: &SpoolNote) -> io::Result<()> {
+        // Each refused record is noted, so the file stays open. One that was removed is replaced.
+        if let Some(file) = self.note.as_ref().filter(|file| file.is_linked().unwrap_or(false)) {
+            return file.write_all_at(&note.to_bytes(), 0);
+        }
         let file = self.open_file(NOTE, OFlags::WRONLY | OFlags::CREATE)?;
         file.write_all_at(&note.to_bytes(), 0)
     }

@@ -4,7 +4,7 @@
 use crate::format::{GapReason, u64_at};
 
 /// Length of the file.
-pub(crate) const NOTE_LEN: usize = 54;
+pub(crate) const NOTE_LEN: usize = 69;
 
 /// The state of a stream, as its writer has noted it last.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -23,56 +23,42 @@ pub struct SpoolNote {
     pub lost_ns: i64,
     /// See `lost_ns`.
     pub reason: Option<GapReason>,
-    /// True while numbers below `next` are lost with their writer.
-    pub is_failing: bool,
+    /// Time since which writing fails, as `lost_ns`; 0 if it does not.
+    pub failing_ns: i64,
+    /// Records that wait while writing fails, without gap records; lost if `failing_ns` is 0.
+    pub queued: u64,
 }
 
 impl SpoolNote {
     pub(crate) fn to_bytes(self) -> Vec<u8> {
-        let numbers = [self.durable, self.next, self.removed, self.lost, self.pending];
-        let mut bytes: Vec<u8> = numbers.iter().flat_map(|number| number.to_le_bytes()).collect();
-        bytes.extend(self.lost_ns.to_le_bytes());
-        bytes.extend([self.reason.map_or(0, |reason| reason as u8), self.is_failing.into()]);
+        let [lost_ns, failing_ns] = [self.lost_ns, self.failing_ns].map(i64::cast_unsigned);
+        let SpoolNote { durable, next, removed, lost, pending, queued, .. } = self;
+        let numbers = [durable, next, removed, lost, pending, lost_ns, failing_ns, queued];
+        let mut bytes = numbers.map(u64::to_le_bytes).concat();
+        bytes.push(self.reason.map_or(0, |reason| reason as u8));
         bytes.extend(crc32fast::hash(&bytes).to_le_bytes());
         bytes
     }
 
-    /// Returns the note, unless its checksum differs.
+    /// Returns the note, also a shorter one of an earlier version, unless its checksum differs.
     pub(crate) fn parse(bytes: &[u8; NOTE_LEN]) -> Option<SpoolNote> {
-        let (content, crc) = bytes.split_at(NOTE_LEN - 4);
-        (crc32fast::hash(content).to_le_bytes() == crc).then(|| SpoolNote {
-            durable: u64_at(bytes, 0),
-            next: u64_at(bytes, 8),
-            removed: u64_at(bytes, 16),
-            lost: u64_at(bytes, 24),
-            pending: u64_at(bytes, 32),
-            lost_ns: u64_at(bytes, 40).cast_signed(),
-            reason: GapReason::from_code(bytes[48]),
-            is_failing: bytes[49] != 0,
-        })
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_note_is_read_as_it_was_written_and_not_at_all_if_it_was_changed() {
-        let (reason, next) = (Some(GapReason::DiskFull), 1 << 40);
-        let note = SpoolNote {
-            next,
-            lost: 7,
-            lost_ns: -1,
-            reason,
-            is_failing: true,
-            removed: 3,
-            ..SpoolNote::default()
+        let is_whole = |len: &usize| {
+            let (content, crc) = bytes[..*len].split_at(len - 4);
+            crc32fast::hash(content).to_le_bytes() == crc
         };
-        let mut bytes: [u8; NOTE_LEN] = note.to_bytes().try_into().unwrap();
-        assert_eq!(SpoolNote::parse(&bytes), Some(note));
-        bytes[20] ^= 1;
-        assert_eq!(SpoolNote::parse(&bytes), None);
-        assert_eq!(SpoolNote::parse(&[0; NOTE_LEN]), None);
+        let len = [NOTE_LEN, 54].into_iter().find(is_whole)?;
+        let [durable, next, removed, lost, pending, lost_ns, failing_ns, queued] =
+            [0, 8, 16, 24, 32, 40, 48, 56].map(|at| u64_at(bytes, at));
+        // The earlier version noted whether writing fails, not since when, nor how many wait.
+        let numbers = next.saturating_sub(durable).saturating_sub(pending);
+        let (failing_ns, queued, reason) = match (len, bytes[49]) {
+            (NOTE_LEN, _) => (failing_ns, queued, bytes[64]),
+            (_, 0) => (0, 0, bytes[48]),
+            _ => (lost_ns.max(1), numbers, bytes[48]),
+        };
+        let [lost_ns, failing_ns] = [lost_ns, failing_ns].map(u64::cast_signed);
+        let reason = GapReason::from_code(reason);
+        let counts = SpoolNote { durable, next, removed, lost, pending, ..SpoolNote::default() };
+        Some(SpoolNote { lost_ns, reason, failing_ns, queued, ..counts })
     }
 }

@@ -3,14 +3,16 @@
 use std::collections::VecDeque;
 
 use crate::SpoolTime;
-use crate::format::{HEAD_LEN, RecordHead, seal};
+use crate::format::{GAP_KIND, HEAD_LEN, RecordHead, seal};
 
 /// Encoded records in one buffer, so that a commit is one write.
 #[derive(Debug, Default)]
 pub(crate) struct RecordQueue {
     bytes: Vec<u8>,
-    /// Number and length in `bytes` of each record.
-    records: VecDeque<(u64, usize)>,
+    /// Number, length in `bytes`, and kind of each record.
+    records: VecDeque<(u64, usize, u8)>,
+    /// Number of records that are no gap records.
+    pub(crate) appended: u64,
 }
 
 /// The oldest records that fit into a segment.
@@ -27,7 +29,8 @@ impl RecordQueue {
         let head = RecordHead { len: payload.len(), payload_crc, seq, time, kind };
         self.bytes.extend_from_slice(&head.to_bytes());
         self.bytes.extend_from_slice(payload);
-        self.records.push_back((seq, HEAD_LEN + payload.len()));
+        self.records.push_back((seq, HEAD_LEN + payload.len(), kind));
+        self.appended += u64::from(kind != GAP_KIND);
     }
 
     pub(crate) fn len(&self) -> usize {
@@ -36,14 +39,14 @@ impl RecordQueue {
 
     /// Number and length of the oldest record.
     pub(crate) fn front(&self) -> Option<(u64, usize)> {
-        self.records.front().copied()
+        self.records.front().map(|(seq, len, _)| (*seq, *len))
     }
 
     /// Returns the oldest records that fit into `room` bytes and whose numbers are consecutive,
     /// sealed for the segment with `salt`.
     pub(crate) fn seal_group(&mut self, room: usize, salt: u64) -> SealedGroup<'_> {
         let (mut taken, mut records, mut end) = (0, 0, 0);
-        for (seq, len) in &self.records {
+        for (seq, len, _) in &self.records {
             if taken + len > room || (records > 0 && *seq != end) {
                 break;
             }
@@ -55,7 +58,9 @@ impl RecordQueue {
 
     /// Removes the `count` oldest records.
     pub(crate) fn remove(&mut self, count: usize) {
-        let bytes: usize = self.records.drain(..count).map(|(_, len)| len).sum();
+        let own = self.records.iter().take(count).filter(|(_, _, kind)| *kind != GAP_KIND);
+        self.appended -= own.count() as u64;
+        let bytes: usize = self.records.drain(..count).map(|(_, len, _)| len).sum();
         self.bytes.drain(..bytes);
     }
 }

@@ -47,7 +47,6 @@ pub struct SpoolReader<S: SpoolStorage = SpoolFolder> {
     stream: String,
     /// The number of the next item; `None` before the first segment was found.
     expected: Option<u64>,
-    limit: u64,
     /// First numbers of the segments, when they were last listed. Listed again only at the end of
     /// the last one, or if one is missing: a writer changes nothing but that end.
     names: Vec<u64>,
@@ -97,7 +96,6 @@ impl<S: SpoolStorage> SpoolReader<S> {
             storage,
             stream: stream.to_owned(),
             expected: from,
-            limit: u64::MAX,
             names: Vec::new(),
             current: None,
             damaged: false,
@@ -137,19 +135,10 @@ impl<S: SpoolStorage> SpoolReader<S> {
         };
         let (first, is_named) = (current.first, current.is_named);
         let names = || if is_named { Ok(()) } else { self.storage.sync_names() };
+        // What replaces a segment was durable before, and has all of its records.
         let synced = current.scan.sync().and_then(|()| names());
-        let is_linked = current.scan.is_linked()?;
         (current.is_unsynced, current.is_named) = (false, true);
-        synced.map_err(|source| self.failed(Some(first), source))?;
-        if !is_linked {
-            self.list()?;
-            // One that the budget removed is not listed.
-            if self.names.binary_search(&first).is_ok() {
-                let source = io::Error::new(io::ErrorKind::NotFound, "it was replaced");
-                return Err(self.failed(Some(first), source));
-            }
-        }
-        Ok(())
+        synced.map_err(|source| self.failed(Some(first), source))
     }
 
     /// Continues with number `to`, a former [`position`](Self::position).
@@ -168,13 +157,6 @@ impl<S: SpoolStorage> SpoolReader<S> {
         self.storage.release(before).map_err(|source| self.failed(None, source))
     }
 
-    /// Ends the iteration before number `limit`, until the next call. A reader that follows a
-    /// writer in the same process passes [`SpoolWriter::durable`](crate::SpoolWriter::durable): it
-    /// then returns nothing that a power cut could take back.
-    pub fn set_limit(&mut self, limit: u64) {
-        self.limit = limit;
-    }
-
     /// Returns the number of the next item; `None` before the first one was found, of a reader that
     /// begins with the oldest.
     pub fn position(&self) -> Option<u64> {
@@ -183,9 +165,6 @@ impl<S: SpoolStorage> SpoolReader<S> {
 
     fn advance(&mut self) -> Result<Option<SpoolItem>, SpoolError> {
         loop {
-            if self.expected.is_some_and(|expected| expected >= self.limit) {
-                return Ok(None);
-            }
             let (Some(current), Some(expected)) = (&mut self.current, self.expected) else {
                 match self.first_segment()? {
                     Some(first) => self.enter(first)?,
@@ -199,7 +178,6 @@ impl<S: SpoolStorage> SpoolReader<S> {
                     self.consume(&head);
                     continue;
                 }
-                Some(head) if head.seq >= self.limit => return Ok(None),
                 Some(head) => Some(self.item(&head, expected)?),
                 None => match self.segment_end(expected)? {
                     SegmentEnd::Continue => continue,

@@ -75,7 +75,7 @@ impl<F: SegmentFile> SegmentScan<F> {
         self.find_record(length).map_err(|source| self.failed(source))
     }
 
-    /// Parses the header, which its writer may not have written yet.
+    /// Parses the header, which a writer of an earlier version may not have written yet.
     fn find_header(&mut self, length: u64) -> Result<(), SpoolError> {
         if length < HEADER_LEN as u64 {
             return Ok(());

@@ -23,8 +23,11 @@ pub trait SpoolStorage {
         Ok(self.list()?.into_iter().map(|(first, _)| first).collect())
     }
 
-    /// Creates a segment, in place of any of the same name.
-    fn create(&self, first: u64) -> io::Result<Self::File>;
+    /// Creates the file of the next segment, in place of one that was not published.
+    fn create(&self) -> io::Result<Self::File>;
+
+    /// Gives the created file the name of segment `first`, in place of any of that name.
+    fn publish(&self, first: u64) -> io::Result<()>;
 
     /// Opens a segment for reading.
     ///

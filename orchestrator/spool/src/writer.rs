@@ -52,18 +52,12 @@ pub struct TornTail {
 pub struct SpoolStatus {
     /// Number that the next record gets.
     pub next: u64,
-    /// First number that is not acknowledged.
-    pub durable: u64,
-    /// Bytes in the queue.
-    pub queued_bytes: usize,
     /// Bytes of all segments, in whole blocks of 4 KiB.
     pub disk_bytes: u64,
     /// Records that were refused since the queue was full.
     pub refused: u64,
     /// Numbers that the budget removed and the consumer had not released.
     pub removed: u64,
-    /// Commits that failed.
-    pub failed_commits: u64,
 }
 
 /// Appends records to a stream. Only one writer at a time has a stream.
@@ -86,7 +80,6 @@ pub struct SpoolWriter<S: SpoolStorage = SpoolFolder> {
     refused: Option<(u64, GapReason)>,
     /// The reason why the last commit failed.
     failure: Option<GapReason>,
-    recovered: Option<TornTail>,
     counts: SpoolStatus,
     /// The next note, and the one that is written.
     note: SpoolNote,
@@ -155,25 +148,24 @@ impl<S: SpoolStorage> SpoolWriter<S> {
             durable: 0,
             refused: None,
             failure: None,
-            recovered: None,
             counts: SpoolStatus::default(),
             note: SpoolNote::default(),
             written_note: None,
             storage,
             config,
         };
+        writer.note = writer.storage.noted().ok().flatten().unwrap_or_default();
         if let Some((first, _)) = last {
             writer.recover(first)?;
             // No writer uses up the other half.
             if writer.next > SEQ_END / 2 {
-                return Err(SpoolError::Numbers { stream: writer.config.stream, first });
+                return Err(SpoolError::Numbers { stream: writer.config.stream.clone(), first });
             }
         }
         // Numbers that a disk has lost are used again, and were not released.
         if writer.storage.released().is_ok_and(|released| released > writer.next) {
             let _ = writer.storage.release(writer.durable);
         }
-        writer.note = writer.storage.noted().ok().flatten().unwrap_or_default();
         // Those of numbers that are used again were not removed.
         writer.note.removed = writer.note.removed.min(writer.next);
         writer.mark_taken();
@@ -181,13 +173,16 @@ impl<S: SpoolStorage> SpoolWriter<S> {
         Ok(writer)
     }
 
-    /// Marks the numbers that a writer gave out while writing failed, and that were lost with it.
+    /// Counts the records that a writer lost while writing failed, and marks the numbers that it
+    /// gave out.
     fn mark_taken(&mut self) {
-        let SpoolNote { next, reason, .. } = self.note;
-        let Some(reason) = reason.filter(|_| self.note.is_failing) else { return };
+        let SpoolNote { next, queued, pending, lost_ns, reason, failing_ns, .. } = self.note;
+        let Some(reason) = reason.filter(|_| queued + pending > 0) else { return };
+        let is_new = queued > 0 && failing_ns != 0;
+        self.note.lost_ns = if is_new { SpoolTime::now().wall_ns } else { lost_ns };
+        (self.note.pending, self.failure) = (queued + pending, Some(reason));
+        // The gap of a torn tail may have all of them.
         if (self.next + 1..SEQ_END / 2).contains(&next) {
-            (self.note.pending, self.failure) = (next - self.next, Some(reason));
-            self.note.lost_ns = SpoolTime::now().wall_ns;
             let from = std::mem::replace(&mut self.next, next);
             self.push_gap(from, next - 1, reason);
         }
@@ -196,7 +191,11 @@ impl<S: SpoolStorage> SpoolWriter<S> {
     /// Notes what a kill would take, if it has changed. A note that cannot be written is lost with
     /// the writer only.
     fn keep_note(&mut self) {
-        self.note.is_failing = self.failure.is_some() || self.note.pending > 0;
+        let is_failing = self.failure.is_some() || self.note.pending > 0;
+        self.note.queued = if is_failing { self.queue.appended } else { 0 };
+        if is_failing != (self.note.failing_ns != 0) {
+            self.note.failing_ns = if is_failing { SpoolTime::now().wall_ns } else { 0 };
+        }
         (self.note.durable, self.note.next) = (self.durable, self.next);
         if self.written_note != Some(self.note) {
             self.written_note = self.storage.note(&self.note).is_ok().then_some(self.note);
@@ -212,13 +211,16 @@ impl<S: SpoolStorage> SpoolWriter<S> {
         let mut scan = SegmentScan::new(file, &stream, first);
         self.next = first;
         while let Some(head) = scan.peek()? {
+            // Written whole after the note: at most one group was, so it is in this segment.
+            let is_queued = head.seq >= self.note.durable && head.kind != GAP_KIND;
+            self.note.queued = self.note.queued.saturating_sub(is_queued.into());
             self.next = head.seq + 1;
             scan.skip(&head);
         }
         // What a killed writer wrote may not be durable yet, but readers get it from now on.
         scan.sync().and_then(|()| self.storage.sync_names()).map_err(failed)?;
+        self.durable = self.next;
         if scan.torn > 0 {
-            self.recovered = Some(TornTail { from: self.next, bytes: scan.torn });
             // A segment without a header counts its header, which is no record.
             let header = if scan.header.is_some() { 0 } else { HEADER_LEN as u64 };
             let records = scan.torn.saturating_sub(header).div_ceil(HEAD_LEN as u64);
@@ -230,7 +232,6 @@ impl<S: SpoolStorage> SpoolWriter<S> {
                 self.push_gap(from, self.next - 1, GapReason::Torn);
             }
         }
-        self.durable = self.recovered.map_or(self.next, |torn| torn.from);
         Ok(())
     }
 
@@ -266,7 +267,7 @@ impl<S: SpoolStorage> SpoolWriter<S> {
         }
         self.next += 1;
         self.queue.push(seq, kind.get(), time, payload);
-        if self.failure.is_some() {
+        if self.note.failing_ns != 0 {
             self.keep_note();
         }
         Ok(seq)
@@ -289,7 +290,6 @@ impl<S: SpoolStorage> SpoolWriter<S> {
         }
         if let Err(source) = written {
             self.active = None;
-            self.counts.failed_commits += 1;
             let reason =
                 if is_full(&source) { GapReason::DiskFull } else { GapReason::WriteFailed };
             (self.failure, self.note.reason) = (Some(reason), Some(reason));
@@ -314,21 +314,10 @@ impl<S: SpoolStorage> SpoolWriter<S> {
         self.queue.len()
     }
 
-    /// Returns the torn tail that an earlier writer left, if any. A gap record with
-    /// [`GapReason::Torn`] will replace it.
-    pub fn recovered(&self) -> Option<TornTail> {
-        self.recovered
-    }
-
     /// Returns the counts and the state of the stream.
     pub fn status(&self) -> SpoolStatus {
-        SpoolStatus {
-            next: self.next,
-            durable: self.durable,
-            queued_bytes: self.queue.len(),
-            disk_bytes: self.segments.iter().map(Segment::disk_bytes).sum(),
-            ..self.counts
-        }
+        let disk_bytes = self.segments.iter().map(Segment::disk_bytes).sum();
+        SpoolStatus { next: self.next, disk_bytes, ..self.counts }
     }
 
     fn segment_max(&self) -> u64 {
@@ -370,6 +359,9 @@ impl<S: SpoolStorage> SpoolWriter<S> {
             active.file.append(group.bytes)?;
             active.file.sync()?;
             if !active.named {
+                // Not before: readers may have returned records that a failed write left in the
+                // former segment. A kill leaves that one, or a segment with all of them.
+                self.storage.publish(first)?;
                 self.storage.sync_names()?;
                 active.named = true;
             }
@@ -379,6 +371,7 @@ impl<S: SpoolStorage> SpoolWriter<S> {
             let (records, end) = (group.records, group.end);
             (active.end, self.durable) = (end, end);
             self.queue.remove(records);
+            self.keep_note();
             self.remove_marked();
         }
         Ok(())
@@ -387,7 +380,7 @@ impl<S: SpoolStorage> SpoolWriter<S> {
     /// Begins a segment with number `first`, which no segment holds acknowledged.
     fn begin_segment(&mut self, first: u64) -> io::Result<()> {
         self.active = None;
-        let file = self.storage.create(first)?;
+        let file = self.storage.create()?;
         // A segment of the same name had nothing that was acknowledged, and is replaced.
         self.segments.retain(|segment| segment.first != first);
         let bytes = HEADER_LEN as u64;
@@ -464,6 +457,16 @@ impl<S: SpoolStorage> SpoolWriter<S> {
         let gap = SpoolGap { from, to, reason, record: None };
         self.queue.push(seq, GAP_KIND, SpoolTime::now(), &gap.to_payload());
         seq
+    }
+}
+
+impl<S: SpoolStorage> Drop for SpoolWriter<S> {
+    fn drop(&mut self) {
+        // Nothing of it waits any longer.
+        if let Some(note) = self.written_note.filter(|note| note.queued > 0) {
+            let lost_ns = SpoolTime::now().wall_ns;
+            let _ = self.storage.note(&SpoolNote { lost_ns, failing_ns: 0, ..note });
+        }
     }
 }
 

@@ -1,5 +1,5 @@
 //! Writes the events of a vehicle to a spool, in a thread: a disk that is slow or full delays
-//! nothing else.
+//! nothing else, and a spool that cannot be opened keeps no program from starting.
 
 use std::io::Write;
 use std::num::NonZeroU8;
@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use gleaner_base::{ByteSize, Exit, Failure, chain};
 use gleaner_protocol::supervision::VehicleEvent;
-use gleaner_spool::{BootId, SpoolConfig, SpoolTime, SpoolWriter};
+use gleaner_spool::{BootId, SpoolConfig, SpoolError, SpoolTime, SpoolWriter};
 
 /// Kind of the records: JSON of a [`VehicleEvent`].
 const EVENT: NonZeroU8 = NonZeroU8::MIN;
@@ -31,24 +31,29 @@ pub struct EventLog {
 }
 
 impl EventLog {
-    /// Opens the spool `stream` in the folder `spool`.
+    /// Opens the spool `stream` in the folder `spool`. Until that succeeds, it is tried again, and
+    /// events are lost and counted.
     ///
     /// # Errors
     ///
-    /// A failure that names the folder.
+    /// A failure that names the folder if another program writes to it.
     pub fn open(spool: &Path, stream: &str) -> Result<Self, Failure> {
         let cannot =
             |error: &dyn std::error::Error| Failure::caused_by(Exit::Internal, "cannot log", error);
         let boot = BootId::current().map_err(|error| cannot(&error))?;
         let config = SpoolConfig { stream: stream.to_owned(), boot, budget: BUDGET };
-        let writer = SpoolWriter::open(&spool.join(stream), config)
-            .map_err(|error| Failure::because("cannot open the log of events", &error))?;
+        let path = spool.join(stream);
+        let open = move || SpoolWriter::open(&path, config.clone());
+        let writer = open();
+        if let Err(error @ SpoolError::Busy { .. }) = &writer {
+            return Err(Failure::because("cannot open the log of events", error));
+        }
         let (events, queue) = sync_channel(QUEUE);
         let lost = Arc::new(AtomicU64::new(0));
         let counted = Arc::clone(&lost);
         let thread = Builder::new().name("events".to_owned());
-        let thread =
-            thread.spawn(move || write(writer, &queue, &counted)).map_err(|it| cannot(&it))?;
+        let thread = thread.spawn(move || write(&open, writer, &queue, &counted));
+        let thread = thread.map_err(|it| cannot(&it))?;
         Ok(Self { events: Some(events), lost, thread: Some(thread) })
     }
 
@@ -78,7 +83,12 @@ impl Drop for EventLog {
 }
 
 /// Writes events until the other end of `queue` is dropped. All that wait become durable together.
-fn write(mut writer: SpoolWriter, queue: &Receiver<(SpoolTime, Vec<u8>)>, lost: &AtomicU64) {
+fn write(
+    open: &dyn Fn() -> Result<SpoolWriter, SpoolError>,
+    mut writer: Result<SpoolWriter, SpoolError>,
+    queue: &Receiver<(SpoolTime, Vec<u8>)>,
+    lost: &AtomicU64,
+) {
     let mut is_failing = false;
     loop {
         // What could not be written waits in the spool's own queue.
@@ -87,21 +97,50 @@ fn write(mut writer: SpoolWriter, queue: &Receiver<(SpoolTime, Vec<u8>)>, lost: 
             false => queue.recv().map_err(|_| RecvTimeoutError::Disconnected),
         };
         if first == Err(RecvTimeoutError::Disconnected) {
-            let _ = writer.commit();
+            let _ = writer.map(|mut writer| writer.commit());
             return;
         }
+        writer = writer.or_else(|_| open());
         for (time, text) in first.into_iter().chain(queue.try_iter()) {
             // A gap record marks one that is refused.
-            let refused = writer.append(EVENT, time, &text).is_err();
+            let refused = !writer.as_mut().is_ok_and(|it| it.append(EVENT, time, &text).is_ok());
             lost.fetch_add(u64::from(refused), Ordering::Relaxed);
         }
-        let committed = writer.commit();
-        if let Err(error) = &committed
-            && !is_failing
-        {
-            let text = format!("events are not durable, and tried again: {}", chain(error));
-            let _ = writeln!(std::io::stderr(), "{text}");
+        let error = match &mut writer {
+            Ok(it) => it.commit().err().map(|it| format!("not durable yet: {}", chain(&it))),
+            Err(error) => Some(format!("lost until the spool can be opened: {}", chain(error))),
+        };
+        if let Some(error) = error.as_ref().filter(|_| !is_failing) {
+            let _ = writeln!(std::io::stderr(), "events are {error}");
         }
-        is_failing = committed.is_err();
+        is_failing = error.is_some();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use gleaner_protocol::supervision::EventKind;
+    use gleaner_spool::SpoolReader;
+
+    use super::*;
+
+    #[test]
+    fn events_are_lost_and_counted_until_the_spool_can_be_opened() {
+        let scratch = tempfile::tempdir().unwrap();
+        let path = scratch.path().join("events");
+        std::fs::write(&path, "no folder").unwrap();
+        let log = EventLog::open(scratch.path(), "events").unwrap();
+        let (event, text) = (EventKind::Started, "the supervisor has started".to_owned());
+        let event = VehicleEvent { event, lambda: None, revision: None, text };
+        log.add(&event);
+        let added = std::time::Instant::now();
+        while log.lost() == 0 {
+            assert!(added.elapsed() < Duration::from_secs(60), "no event was counted as lost");
+            std::thread::yield_now();
+        }
+        std::fs::remove_file(&path).unwrap();
+        log.add(&event);
+        drop(log);
+        assert_eq!(SpoolReader::open(&path, "events", None).unwrap().count(), 1);
     }
 }

@@ -8,10 +8,8 @@
 
 use std::net::{Ipv4Addr, SocketAddrV4, UdpSocket};
 
-use gleaner_protocol::ingress::JoinedParticipant;
+use gleaner_protocol::ingress::{DISCOVERY_GROUP, JoinedParticipant};
 
-/// The group of RTPS for discovery.
-const GROUP: Ipv4Addr = Ipv4Addr::new(239, 255, 0, 1);
 /// Copies that are sent, as one may be lost.
 const COPIES: usize = 3;
 /// Participants of this machine to which it is also sent directly, as it may have no multicast.
@@ -31,7 +29,7 @@ pub(crate) fn send(joined: &JoinedParticipant) {
         }
     };
     for address in &joined.addresses {
-        send(*address, SocketAddrV4::new(GROUP, joined.port));
+        send(*address, SocketAddrV4::new(DISCOVERY_GROUP, joined.port));
     }
     for index in 0..PARTICIPANTS {
         let port = joined.port.saturating_add(10 + 2 * index);

@@ -35,7 +35,7 @@ const CASES: [Case; 30] = [
     ("deployments_at_once_do_not_disturb_each_other", deployments::at_once),
     ("what_is_not_signed_for_this_vehicle_is_refused", refused::signatures),
     ("a_file_that_was_changed_later_does_not_start", refused::changed_file),
-    ("a_lambda_waits_without_seccomp_and_is_not_blamed", refused::seccomp),
+    ("a_lambda_waits_for_a_layer_that_its_machine_lacks_and_is_not_blamed", refused::layers),
     ("a_removed_deployment_is_gone_and_its_releases_stay_known", deployments::removed),
     ("revisions_outlive_a_lost_state", refused::lost_state),
     ("a_deployment_that_could_not_be_read_is_verified_again", refused::retried),

@@ -42,26 +42,33 @@ pub fn signatures() {
 }
 
 /// Its process cannot be sandboxed, as in a container: the machine is at fault.
-pub fn seccomp() {
+pub fn layers() {
     let mut vehicle = TestVehicle::new();
-    let lambda = ticker("rust", "ticker");
-    without(libc::SYS_seccomp, || {
-        vehicle.start();
-        let deployed = text(&vehicle.deploy(lambda.path(), &["--timeout", "1s"]));
-        assert!(!deployed.contains("repair the lambda"), "{deployed}");
-        // More starts than an end before it is ready would be forgiven.
-        let status = vehicle.until("further starts", |vehicle| {
-            vehicle.deployment("ticker").status.filter(|status| status.restarts > 3)
+    let refused = [
+        (libc::SYS_seccomp, "rust", "`system calls` does not hold"),
+        // Without it, an interpreter has no bound of memory.
+        (libc::SYS_prlimit64, "python", "`needed calls` does not hold; cause: `prlimit64`: "),
+    ];
+    for (call, kind, expected) in refused {
+        let lambda = ticker(kind, kind);
+        without(call, || {
+            vehicle.start();
+            let deployed = text(&vehicle.deploy(lambda.path(), &["--timeout", "1s"]));
+            assert!(!deployed.contains("repair the lambda"), "{deployed}");
+            // More starts than an end before it is ready would be forgiven.
+            let status = vehicle.until("further starts", |vehicle| {
+                vehicle.deployment(kind).status.filter(|status| status.restarts > 3)
+            });
+            assert_ne!(status.phase, LambdaPhase::Quarantined);
+            let reason = gleaner_base::in_one_line(&status.last_end.unwrap_or_default());
+            assert!(reason.contains(expected), "{reason}");
+            let shown = text(&vehicle.gleaner(&["status"]));
+            assert!(shown.contains(expected), "{shown}");
+            vehicle.stop();
         });
-        assert_ne!(status.phase, LambdaPhase::Quarantined);
-        let reason = status.last_end.unwrap_or_default();
-        assert!(reason.contains("`system calls` does not hold"), "{reason}");
-        let shown = text(&vehicle.gleaner(&["status"]));
-        assert!(shown.contains("`system calls` does not hold"), "{shown}");
-        vehicle.stop();
-    });
+    }
     vehicle.start();
-    vehicle.until_running(&["ticker"]);
+    vehicle.until_running(&["rust", "python"]);
 }
 
 pub fn changed_file() {

@@ -110,8 +110,8 @@ impl<'c> ClipTarget<'c> {
     }
 
     fn compare(&self, path: &Path) -> io::Result<Result<(), String>> {
-        let announced = AnnouncedFile::new(self.clip.facts.bytes, self.sha256);
-        announced.compare(safe_file::read(path)?)
+        let announced = AnnouncedFile::new(self.clip.facts.bytes);
+        announced.compare(self.sha256, safe_file::read(path)?)
     }
 }
 

@@ -159,8 +159,8 @@ struct Handshake {
 }
 
 impl Handshake {
-    /// Returns the stream, and gives its turn to `peer`; `None` if the other side is too slow, or
-    /// wrong. One that sends nothing takes no turn, and is the first to end at a bound.
+    /// Returns the stream, and gives its turn to `peer`, whose work goes on; `None` if the other
+    /// side is too slow, or wrong. One that sends nothing takes no turn.
     async fn done<S>(self, stream: S, peer: &PeerConnection) -> Option<TlsStream<S>>
     where
         S: AsyncRead + AsyncWrite + Unpin,
@@ -173,10 +173,11 @@ impl Handshake {
         let handshake = timeout(HANDSHAKE, begun.into_stream(self.config));
         tokio::pin!(handshake);
         let mut accepted = timeout(HANDSHAKE_COUNTS, handshake.as_mut()).await;
-        peer.client.end_work();
         if accepted.is_err() {
+            peer.client.end_work();
             peer.end_turn();
             accepted = Ok(handshake.await);
+            peer.client.begin_work();
         }
         accepted.ok()?.ok()?.ok()
     }
@@ -210,11 +211,14 @@ async fn connection(
         return;
     };
     let certificates = stream.get_ref().1.peer_certificates();
-    let certificate = certificates.and_then(|all| all.first());
-    peer.certificate = certificate.map(|it| gleaner_base::hex(&Sha256::digest(it)));
-    if peer.certificate.is_some() && !peer.client.become_known() {
-        return;
+    let certificate = certificates.and_then(|all| all.first()).map(Sha256::digest);
+    peer.certificate = certificate.map(|it| gleaner_base::hex(&it));
+    match certificate {
+        None => peer.client.stay_stranger(),
+        Some(certificate) if peer.client.become_known(certificate.into()) => {}
+        Some(_) => return,
     }
+    peer.client.end_work();
     requests(stream, peer, handler, stop).await;
 }
 
@@ -239,7 +243,7 @@ async fn requests(
             open.0.end_turn();
             if answer.status() == StatusCode::SWITCHING_PROTOCOLS {
                 // It is in use until it ends.
-                open.0.client.begin_work();
+                open.0.client.keep();
             }
             // The body has its request until it is sent.
             let body = |body: Body| body.map_err(move |error| (error, &open).0);

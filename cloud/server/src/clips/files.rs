@@ -4,12 +4,11 @@
 //! file one after the other; in a bucket, each is an object with its digest in the name: a part
 //! that comes to another replica replaces none. Which parts count is in the database only.
 
-use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{self, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{self, Arc, PoisonError};
 use std::time::Duration;
 
 use axum::body::Body;
@@ -19,18 +18,15 @@ use gleaner_base::sync_folder;
 use gleaner_fleet::clips::ClipId;
 use gleaner_fleet::{AnnouncedFile, UnfinishedFile};
 use gleaner_trust::sha256;
-use tokio::sync::{Mutex, OwnedMutexGuard, OwnedSemaphorePermit, Semaphore};
+use tokio::sync::{Mutex, OwnedMutexGuard};
 use tokio::time::timeout;
 
-use crate::error::{CloudError, CloudResult};
+use crate::error::CloudResult;
 use crate::folder::PART;
 use crate::place::{FilePlace, blocking};
 use crate::store::{ClipBounds, ClipProgress, StoredPart};
 use crate::transfer::{IncomingFile, PIECE_TIME, ReceivedPiece, StoredBytes};
 
-/// Number of parts of a vehicle that are received at a time: some may be of connections that it
-/// has lost.
-const PARTS_MAX: usize = 4;
 /// Time without any byte after which a piece ends: sooner than a vehicle notices that a connection
 /// is dead, and asks where to go on.
 const SILENCE: Duration = Duration::from_secs(15);
@@ -49,15 +45,13 @@ pub(crate) struct ClipFiles {
     place: FilePlace,
     pub(crate) bounds: ClipBounds,
     parts: AtomicU64,
-    /// Slots of the vehicles that send parts.
-    slots: sync::Mutex<BTreeMap<String, Arc<Semaphore>>>,
     turns: Vec<Arc<Mutex<()>>>,
 }
 
 impl ClipFiles {
     pub(crate) fn new(place: FilePlace, bounds: ClipBounds) -> Self {
         let turns = (0..TURNS).map(|_| Arc::default()).collect();
-        Self { place, bounds, parts: AtomicU64::new(0), slots: sync::Mutex::default(), turns }
+        Self { place, bounds, parts: AtomicU64::new(0), turns }
     }
 
     /// Returns the path of the recording of a clip in the folder.
@@ -148,18 +142,6 @@ impl ClipFiles {
         self.place.remove(&thumbnail(id)).await
     }
 
-    /// Returns a slot to receive a part of a vehicle in.
-    pub(crate) fn slot(&self, vehicle: &str) -> CloudResult<OwnedSemaphorePermit> {
-        let mut slots = self.slots.lock().unwrap_or_else(PoisonError::into_inner);
-        slots.retain(|_, slots| slots.available_permits() < PARTS_MAX);
-        let slots = slots.entry(vehicle.to_owned());
-        let slots = slots.or_insert_with(|| Arc::new(Semaphore::new(PARTS_MAX)));
-        Arc::clone(slots).try_acquire_owned().map_err(|_| {
-            let message = format!("{PARTS_MAX} parts of the vehicle are received already");
-            CloudError::busy(message, "send one part at a time")
-        })
-    }
-
     /// Waits until no other part of a clip is stored.
     pub(crate) async fn turn(&self, id: &ClipId) -> OwnedMutexGuard<()> {
         let digest = sha256(id.to_string().as_bytes());
@@ -177,8 +159,9 @@ impl ClipFiles {
         let number = self.parts.fetch_add(1, Ordering::Relaxed);
         let path = self.path(id).with_extension(format!("{number}.{PART}"));
         let name = format!("a part of clip `{id}`");
-        let file = IncomingFile { name: &name, length, sha256: "" };
-        Ok(file.receive_some(SILENCE, path, body).await?.0)
+        let file = IncomingFile { name: &name, length };
+        let (file, received, _) = file.receive_some(SILENCE, path, body).await?;
+        Ok(ReceivedPiece { file, bytes: received.received(), sha256: received.into_sha256() })
     }
 
     /// Makes a received file durable as the thumbnail of a clip.
@@ -217,18 +200,18 @@ impl ClipFiles {
         if !self.place.is_bucket() {
             let path = self.path(id);
             return blocking(move || {
-                AnnouncedFile::new(length, &sha256).compare(File::open(path)?)
+                AnnouncedFile::new(length).compare(&sha256, File::open(path)?)
             })
             .await;
         }
-        let mut announced = AnnouncedFile::new(length, &sha256);
+        let mut announced = AnnouncedFile::new(length);
         let mut pieces = self.parts_from(id, (length, parts), 0).into_data_stream();
         while let Some(piece) = timeout(PIECE_TIME, pieces.next()).await? {
             if let Err(reason) = announced.add(&piece.map_err(io::Error::other)?) {
                 return Ok(Err(reason));
             }
         }
-        Ok(announced.finish())
+        Ok(announced.finish(&sha256))
     }
 }
 

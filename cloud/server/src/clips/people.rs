@@ -76,23 +76,33 @@ pub(crate) async fn thumbnail(
         return Err(CloudError::missing(message, "its vehicle sends it when it is connected"));
     }
     let file = (&id, FileOfClip::Thumbnail, clip.facts.thumbnail.as_deref());
-    send(&cloud, file, "image/jpeg", &HeaderMap::new()).await
+    send(&cloud, file, "image/jpeg", &HeaderMap::new(), ()).await
 }
 
 pub(crate) async fn file(
-    State(cloud): State<Arc<Cloud>>,
+    Call(cloud, user): Call<TokenUser>,
     Path(id): Path<String>,
     headers: HeaderMap,
 ) -> CloudResult<Response> {
-    let id = parse(&id)?;
-    let clip = cloud.store.clip(&id).await?;
+    let slot = cloud.transfers.open(&user.user.name)?;
+    recording(&cloud, &parse(&id)?, &headers, slot).await
+}
+
+/// Returns the answer with the file of a clip; it has `slot` until all of it is sent.
+pub(crate) async fn recording(
+    cloud: &Cloud,
+    id: &ClipId,
+    headers: &HeaderMap,
+    slot: impl Send + 'static,
+) -> CloudResult<Response> {
+    let clip = cloud.store.clip(id).await?;
     if clip.state != ClipState::Stored {
         let message =
             format!("the file of clip `{id}` is not in the cloud: {}", clip.state.as_str());
         return Err(CloudError::missing(message, "fetch it: `gleaner clips pull ID`"));
     }
-    let file = FileOfClip::Recording(clip.facts.bytes, cloud.store.clip_parts(&id).await?);
-    send(&cloud, (&id, file, clip.facts.sha256.as_deref()), OCTETS, &headers).await
+    let file = FileOfClip::Recording(clip.facts.bytes, cloud.store.clip_parts(id).await?);
+    send(cloud, (id, file, clip.facts.sha256.as_deref()), OCTETS, headers, slot).await
 }
 
 pub(crate) async fn policy(State(cloud): State<Arc<Cloud>>) -> CloudResult<Json<ClipPolicy>> {
@@ -123,10 +133,11 @@ async fn send(
     (id, file, sha256): (&ClipId, FileOfClip, Option<&str>),
     kind: &'static str,
     headers: &HeaderMap,
+    slot: impl Send + 'static,
 ) -> CloudResult<Response> {
     let name = format!("a file of clip `{id}`");
     let help = "fetch it again: `gleaner clips pull ID`";
     let length = cloud.clips.length(id, &file).await;
     let content = async |begin| cloud.clips.content(id, file, begin).await;
-    OutgoingFile { name: &name, kind, help, sha256 }.send(headers, length, content).await
+    OutgoingFile { name: &name, kind, help, sha256 }.send(slot, headers, length, content).await
 }

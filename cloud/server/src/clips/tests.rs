@@ -18,7 +18,7 @@ const BOUNDS: ClipBounds = ClipBounds {
     clips: 3,
     vehicle_bytes: 100 * MIB,
     bytes: 150 * MIB,
-    unfinished: 1,
+    unfinished: 2,
     unfinished_s: 0,
 };
 const THUMBNAIL: u64 = 256 << 10;
@@ -165,19 +165,27 @@ async fn an_unreadable_clip_is_announced_with_its_cause_and_again_once_it_can_be
 #[tokio::test]
 async fn unfinished_files_are_bounded_and_forgotten_after_a_time() {
     let (_folder, store) = store().await;
-    for name in ["1", "2"] {
+    for name in ["1", "2", "3"] {
         announce(&store, "a", name, 10).await;
     }
-    let first = store.clip_progress("a", &name("1"), BOUNDS).await.unwrap();
-    store.clip_part_received(&first, (8, "d"), false, BOUNDS).await.unwrap();
-    assert_eq!(wanted(&store, "a").await, ["1"], "no other one is begun");
-    let busy = store.clip_progress("a", &name("2"), BOUNDS).await.unwrap_err().reason();
-    assert!(busy.contains("1 uploads of the vehicle are unfinished"), "{busy}");
+    for name in ["1", "2"] {
+        let begun = store.clip_progress("a", &self::name(name), BOUNDS).await.unwrap();
+        store.clip_part_received(&begun, (8, "d"), false, BOUNDS).await.unwrap();
+    }
+    assert_eq!(wanted(&store, "a").await, ["1", "2"], "no other one is begun");
+    let unreadable = json!({ "sha256": null, "unreadable": "Input/output error" });
+    announce_as(&store, "a", "1", unreadable).await;
+    assert_eq!(wanted(&store, "a").await, ["2"], "one that cannot be read is unfinished, too");
+    let busy = store.clip_progress("a", &name("3"), BOUNDS).await.unwrap_err().reason();
+    assert!(busy.contains("2 uploads of the vehicle are unfinished"), "{busy}");
+    let orders = store.clip_orders("a", BOUNDS).await.unwrap();
+    assert_eq!(orders.unreadable, [name("1")], "the vehicle reads it again");
     store.forget_unfinished_clips(3600).await.unwrap();
-    assert_eq!(wanted(&store, "a").await, ["1"], "it is still young");
-    store.forget_unfinished_clips(0).await.unwrap();
-    assert_eq!(store.removed_clips().await.unwrap(), [first.id]);
-    assert_eq!(wanted(&store, "a").await, ["1", "2"]);
+    assert_eq!(store.removed_clips().await.unwrap(), [], "they are still young");
+    store.execute("UPDATE clips SET part_time = part_time - 600").await;
+    store.forget_unfinished_clips(3600).await.unwrap();
+    assert_eq!(store.removed_clips().await.unwrap(), ["1@a".parse().unwrap()]);
+    assert_eq!(wanted(&store, "a").await, ["2", "3"], "there is room for another one");
 }
 
 #[tokio::test]

@@ -3,7 +3,6 @@
 use std::io;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::Duration;
 
 use axum::Json;
 use axum::Router;
@@ -11,25 +10,22 @@ use axum::body::{Body, Bytes};
 use axum::extract::{DefaultBodyLimit, Path};
 use axum::middleware::from_fn;
 use axum::routing::{post, put};
-use futures_util::{StreamExt, TryStreamExt};
+use futures_util::TryStreamExt;
 use gleaner_base::{Exit, Failure};
 use gleaner_fleet::clips::{
     CLIP_PART, CLIP_PIECE_MIN, CLIP_REPORT_MAX, CLIPS_IN_REPORT, ClipFacts, ClipId, ClipName,
     ClipOrders, ClipReport, THUMBNAIL_MAX,
 };
 use gleaner_image::Format;
-use tokio::time::timeout;
 
 use super::remove_noted;
 use crate::cloud::{Call, Cloud};
 use crate::error::{CloudError, CloudResult};
 use crate::request::{digest, in_time, parsed};
 use crate::store::{ClipProgress, StoredPart};
-use crate::transfer::ReceivedPiece;
+use crate::transfer::{ReceivedPiece, skip};
 use crate::vehicles::KnownVehicle;
 
-/// Time for a part that is not wanted.
-const UNWANTED_TIME: Duration = Duration::from_secs(30);
 /// Longest position in the list of a vehicle.
 const CURSOR_MAX: usize = 256;
 /// The reason of a failed upload whose earlier parts were lost.
@@ -175,13 +171,15 @@ async fn store_piece(
     (name, begin): (ClipName, u64),
     body: Body,
 ) -> CloudResult<()> {
-    let expected = expected(cloud, vehicle, &name, begin).await;
-    let Ok(Some((progress, length))) = expected else {
-        // Unread, it could hide the answer from the vehicle.
-        let _ = timeout(UNWANTED_TIME, skip(body)).await;
-        return expected.map(drop);
+    let slot = cloud.transfers.open_of_vehicle(vehicle);
+    let wanted = match &slot {
+        Ok(_) => expected(cloud, vehicle, &name, begin).await,
+        Err(busy) => Err(busy.clone()),
     };
-    let _slot = cloud.clips.slot(vehicle)?;
+    let Ok(Some((progress, length))) = wanted else {
+        skip(body).await;
+        return wanted.map(drop);
+    };
     // Some of it may have come before.
     let mut left = progress.received - begin;
     let length = length - left;
@@ -209,17 +207,6 @@ async fn expected(
     })?;
     let is_next = (begin..begin + length).contains(&progress.received);
     Ok(is_next.then_some((progress, length)))
-}
-
-/// Reads a body that is not wanted, up to the length of a part.
-async fn skip(body: Body) {
-    let (mut pieces, mut bytes) = (body.into_data_stream(), 0);
-    while let Some(Ok(piece)) = pieces.next().await {
-        bytes += piece.len() as u64;
-        if bytes > CLIP_PART {
-            return;
-        }
-    }
 }
 
 /// Appends a piece, and compares the file after the last one.

@@ -98,12 +98,12 @@ pub(super) async fn thumbnail(
 
 /// Answers with the file, to be saved.
 pub(super) async fn file(
-    State(cloud): State<Arc<Cloud>>,
+    Call(cloud, user): Visit,
     Path(id): Path<String>,
     headers: HeaderMap,
 ) -> PageResult {
     let clip = parse(&id)?;
-    let reply = people::file(State(cloud), Path(id), headers).await?;
+    let reply = people::file(Call(cloud, user.token_user()), Path(id), headers).await?;
     // Names of clips are letters, digits and `._-`.
     let name = format!("attachment; filename=\"{}.mcap\"", clip.name());
     Ok(([(header::CONTENT_DISPOSITION, name)], reply).into_response())

@@ -2,10 +2,8 @@
 //! vehicle: only its last part is read, and nothing of it is decompressed.
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
 
 use axum::body::{Body, to_bytes};
-use axum::extract::{Path, State};
 use axum::http::{HeaderMap, HeaderValue, header};
 use axum::response::Response;
 use gleaner_fleet::clips::FleetClip;
@@ -41,13 +39,13 @@ pub(super) struct StoredTopic {
 }
 
 /// Reads the summary of a stored clip; `None` if it has none that can be read.
-pub(super) async fn read(cloud: &Arc<Cloud>, clip: &FleetClip) -> CloudResult<Option<Recording>> {
+pub(super) async fn read(cloud: &Cloud, clip: &FleetClip) -> CloudResult<Option<Recording>> {
     let start = clip.facts.bytes.saturating_sub(TAIL_MAX);
     let mut headers = HeaderMap::new();
     if let Ok(range) = HeaderValue::from_str(&format!("bytes={start}-")) {
         headers.insert(header::RANGE, range);
     }
-    let reply = people::file(State(Arc::clone(cloud)), Path(clip.id.to_string()), headers).await?;
+    let reply = people::recording(cloud, &clip.id, &headers, ()).await?;
     let tail = whole(reply, TAIL_MAX).await.unwrap_or_default();
     Ok(parse(&tail, start))
 }

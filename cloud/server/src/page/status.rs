@@ -262,7 +262,9 @@ fn vehicle(status: &VehicleStatus) -> Markup {
                     @else { span.warn { (count(lost, "event")) " lost" } }
                     @for lost in status.records_lost.iter().take(LAMBDAS_MAX) {
                         br; span.warn {
-                            (count(lost.records, "record")) " of " (shown(&lost.stream)) " lost"
+                            "records of " (shown(&lost.stream))
+                            @if lost.records > 0 { ", " (lost.records) " lost" }
+                            @if lost.waiting > 0 { ", " (lost.waiting) " waiting for the disk" }
                         }
                     }
                 }

@@ -20,6 +20,7 @@ use crate::cloud::{Call, Cloud};
 use crate::error::{CloudError, CloudResult};
 use crate::request::{digest, parsed};
 use crate::store::{OfferedDeployment, TokenUser};
+use crate::transfer::skip;
 
 /// Maximum number of reported releases that are listed.
 const REPORTED_MAX: i64 = 100;
@@ -125,10 +126,15 @@ async fn stored(cloud: &Cloud, digest: &Sha256) -> CloudResult<(Revision, String
 
 /// Receives a file that a deployment needs.
 pub(super) async fn object(
-    State(cloud): State<Arc<Cloud>>,
+    Call(cloud, user): Call<TokenUser>,
     Path(sha256): Path<String>,
     body: Body,
 ) -> CloudResult<StatusCode> {
+    let slot = cloud.transfers.open(&user.user.name);
+    if let Err(busy) = slot {
+        skip(body).await;
+        return Err(busy);
+    }
     cloud.objects.receive(&cloud.store, &digest(&sha256)?, body).await?;
     Ok(StatusCode::NO_CONTENT)
 }

@@ -40,6 +40,7 @@ pub(crate) async fn cloud() -> (TempDir, Arc<Cloud>) {
         readers: Readers::new("streams of records"),
         tails: Arc::default(),
         page_readers: Readers::new("pages of records"),
+        transfers: Readers::new("transfers of files"),
         stored_frames: Semaphore::new(4),
         retention: Retention::DEFAULT,
         keep_records_days: 30,

@@ -1,8 +1,8 @@
 //! Bounds of clips: bytes on the disk of a vehicle and of all, and bytes that arrive in a day.
 //!
-//! What counts is what the disk has: files as announced once some of them is stored, thumbnails,
-//! entries, and files that are still to be removed. Each change that touches one of them counts
-//! those of its vehicle again, so that no difference can add up.
+//! The sum has what is on the disk: files as announced once some of them is stored, thumbnails,
+//! entries, and files that are still to be removed. Each change of one of them makes the sum of its
+//! vehicle again, so that no difference can add up.
 
 use gleaner_fleet::clips::{ClipBudget, ClipId, ClipPolicy};
 
@@ -42,11 +42,11 @@ impl ClipBounds {
 const USED: &str = "SELECT (SELECT COALESCE(MAX(disk), 0) FROM clip_vehicles WHERE vehicle = $1),
     (SELECT CAST(COALESCE(SUM(disk), 0) AS BIGINT) FROM clip_vehicles)";
 
-/// Bytes on the disk.
+/// Bytes that clips take on the disk.
 pub(super) struct UsedBytes {
-    /// Those of a vehicle.
+    /// Bytes of a vehicle.
     own: u64,
-    /// Those of all vehicles.
+    /// Bytes of all vehicles.
     all: u64,
 }
 

@@ -19,6 +19,8 @@ use crate::error::{CloudError, CloudResult};
 const ORDERS_MAX: i64 = 64;
 /// Number of uploads of another file than announced, after which a clip is not wanted any more.
 const FAILURES_MAX: i64 = 3;
+/// Time after which the parts of a file that its vehicle cannot read are forgotten, in s.
+const UNREADABLE_S: u64 = 600;
 
 /// The file of a clip, as it was announced and as far as it was received.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -77,8 +79,16 @@ impl CloudStore {
         let position = row.unwrap_or_default().0;
         let policy = self.clip_policy().await?;
         let budget = self.clip_budget(vehicle, &policy).await?;
+        let unreadable: Vec<(String,)> = rows!(&self.pool;
+            "SELECT name FROM clips WHERE vehicle = $1 AND state = 'failed' AND sha256 = ''
+             ORDER BY is_requested DESC, seq LIMIT $2";
+            vehicle, ORDERS_MAX);
+        let names = |rows: Vec<(String,)>| {
+            rows.into_iter().filter_map(|(name,)| name.parse().ok()).collect()
+        };
         let mut orders = ClipOrders {
             cursor: (!position.is_empty()).then_some(position),
+            unreadable: names(unreadable),
             budget: Some(budget),
             ..ClipOrders::default()
         };
@@ -88,8 +98,7 @@ impl CloudStore {
                  AND has_thumbnail = 0 ORDER BY seq LIMIT $2";
                 vehicle, ORDERS_MAX);
             if !rows.is_empty() && self.clip_usage(vehicle).await?.fits(THUMBNAIL_MAX, bounds) {
-                let names = rows.into_iter().filter_map(|(name,)| name.parse().ok());
-                orders.thumbnails = names.collect();
+                orders.thumbnails = names(rows);
             }
             orders.wanted = self.wanted_clips(vehicle, &policy, bounds).await?;
         }
@@ -125,11 +134,12 @@ impl CloudStore {
         Ok(wanted.filter(fits).collect())
     }
 
-    /// Returns the number of files of a vehicle that have not come in full yet.
+    /// Returns the number of files of a vehicle that have not come in full yet, also of those that
+    /// it cannot read now.
     async fn unfinished_clips(&self, vehicle: &str) -> CloudResult<u64> {
         let (unfinished,): (i64,) = one!(&self.pool;
             "SELECT COUNT(*) FROM clips
-             WHERE vehicle = $1 AND state = 'vehicle' AND parts > 0";
+             WHERE vehicle = $1 AND state IN ('vehicle', 'failed') AND parts > 0";
             vehicle);
         Ok(unsigned(unfinished))
     }
@@ -278,14 +288,16 @@ impl CloudStore {
         change.commit().await
     }
 
-    /// Forgets the parts of files of which none came since `seconds`.
+    /// Forgets the parts of files of which none came since `seconds`. Those that cannot be read
+    /// go much earlier: as they count, others could not begin.
     pub(crate) async fn forget_unfinished_clips(&self, seconds: u64) -> CloudResult<()> {
-        let before = self.age_now() - int(seconds);
+        let [before, unreadable] = [seconds, UNREADABLE_S].map(|it| self.age_now() - int(it));
         let mut change = self.change().await?;
         let rows: Vec<(String, String)> = rows!(&mut *change.tx;
             "SELECT name, vehicle FROM clips
-             WHERE state IN ('vehicle', 'failed') AND parts > 0 AND part_time <= $1";
-            before);
+             WHERE state IN ('vehicle', 'failed') AND parts > 0
+             AND part_time <= CASE WHEN state = 'failed' THEN $2 ELSE $1 END";
+            before, unreadable);
         for (name, vehicle) in &rows {
             change.note_removed(vehicle, name, false).await?;
             run!(&mut *change.tx;

@@ -186,9 +186,10 @@ fn found(envelope: Option<String>, what: &str, digest: &str) -> CloudResult<Resp
 }
 
 async fn object(
-    State(cloud): State<Arc<Cloud>>,
+    Call(cloud, vehicle): Call<KnownVehicle>,
     Path(sha256): Path<String>,
     headers: HeaderMap,
 ) -> CloudResult<Response> {
-    cloud.objects.send(&digest(&sha256)?, &headers).await
+    let slot = cloud.transfers.open_of_vehicle(&vehicle.name)?;
+    cloud.objects.send(slot, &digest(&sha256)?, &headers).await
 }

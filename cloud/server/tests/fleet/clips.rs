@@ -12,11 +12,12 @@ use serde_json::{Value, json};
 use tokio::io::AsyncWriteExt;
 use tokio::time::sleep;
 
-use crate::fake::{FakeVehicle, Person, soon};
+use crate::fake::{FakeVehicle, Person, Signed, soon};
 use crate::{options, start, start_with_vehicle};
 
 /// Time between two looks at what changes soon: with more looks, the vehicle would be in a loop.
 const PAUSE: Duration = Duration::from_millis(250);
+const BUSY: StatusCode = StatusCode::TOO_MANY_REQUESTS;
 
 const IMAGE: &[u8] = &jpeg(1920, 1080);
 
@@ -307,24 +308,24 @@ async fn hostile_uploads_are_refused_and_change_nothing() {
     assert!(status == StatusCode::FORBIDDEN && text.contains("SHA-256"), "{status} {text}");
     assert_eq!(put(&good, "a", 0, b"conten").await.0, StatusCode::OK);
     assert_eq!(orders(&good).await.wanted[0].from, Some(0), "so few bytes are not kept");
-    // Parts that never end take the place of no other vehicle's.
-    let wrong = format!("/v1/clips/liar/parts/0/{}", sha256(b"other"));
-    let mut endless = Vec::new();
-    // One that comes while the request beside it is answered may be refused itself: then one more.
-    while bad.request(Method::PUT, &wrong, b"76").await.0 != StatusCode::TOO_MANY_REQUESTS {
-        let mut stream = bad.stream().await;
-        let head = format!(
-            "PUT /v1/clips/liar/parts/0/{} HTTP/1.1\r\nhost: cloud\r\ncontent-length: 7\r\n\r\n7",
-            sha256(b"7654321")
-        );
-        stream.write_all(head.as_bytes()).await.unwrap();
-        stream.flush().await.unwrap();
-        endless.push(stream);
-        sleep(PAUSE).await;
+    // Files that it does not read take the place of no other vehicle's. Each is more than the
+    // buffers of a connection.
+    let large = Signed::new("large", 1, None, 16 << 20);
+    admin.deploy(&large).await;
+    let object = format!("/v1/objects/{}", sha256(&large.file));
+    let mut unread = Vec::new();
+    for _ in 0..8 {
+        unread.push(bad.open(Method::GET, &object, b"").await);
+        assert_eq!(unread.last().unwrap().status(), StatusCode::OK);
     }
+    let refused = bad.open(Method::GET, &object, b"").await;
+    assert!(refused.status() == BUSY && refused.headers()["retry-after"] == "10");
+    let (status, text) = put(&bad, "liar", 0, b"76").await;
+    assert!(status == BUSY && text.contains("vehicle bad has 8 transfers of files"), "{text}");
     assert_eq!(put(&good, "a", 0, b"conten").await.0, StatusCode::OK);
-    drop(endless);
-    while bad.request(Method::PUT, &wrong, b"76").await.0 == StatusCode::TOO_MANY_REQUESTS {
+    assert!(good.get(&object).await == (StatusCode::OK, large.file));
+    drop(unread);
+    while put(&bad, "liar", 0, b"76").await.0 == BUSY {
         sleep(PAUSE).await;
     }
     // Another file than announced is not wanted any more after some times.

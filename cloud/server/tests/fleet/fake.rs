@@ -154,9 +154,10 @@ pub(crate) struct Signed {
 }
 
 impl Signed {
-    pub(crate) fn new(id: &str, release: u64, fallback: Option<&Self>) -> Self {
+    /// Signs one whose file has at least so many bytes.
+    pub(crate) fn new(id: &str, release: u64, fallback: Option<&Self>, bytes: usize) -> Self {
         let key = SecretKey::generate().unwrap();
-        let file = format!("[lambda]\nname = \"{id}\"\n").into_bytes();
+        let file = format!("[lambda]\nname = \"{id}\"\n{}", " ".repeat(bytes)).into_bytes();
         let revision = Revision {
             name: id.parse().unwrap(),
             version: format!("1.{release}.0").parse().unwrap(),
@@ -272,9 +273,14 @@ impl FakeVehicle {
         path: &str,
         body: &[u8],
     ) -> (StatusCode, Vec<u8>) {
+        whole(self.open(method, path, body).await).await
+    }
+
+    /// Sends a request with the certificate; returns the answer as it begins.
+    pub(crate) async fn open(&self, method: Method, path: &str, body: &[u8]) -> Response<Incoming> {
         let body = Full::new(Bytes::copy_from_slice(body));
         let request = Request::builder().method(method).uri(path).header("host", "cloud");
-        whole(soon(send(self.stream().await, request.body(body).unwrap())).await.unwrap()).await
+        soon(send(self.stream().await, request.body(body).unwrap())).await.unwrap()
     }
 
     /// Opens a connection.

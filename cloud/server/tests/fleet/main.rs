@@ -43,7 +43,7 @@ async fn start_with_vehicle() -> (TempDir, CloudServer, Person, FakeVehicle) {
 }
 
 fn signed(release: u64) -> Signed {
-    Signed::new("brake-dark", release, None)
+    Signed::new("brake-dark", release, None, 0)
 }
 
 fn reported(generation: u64) -> Body {

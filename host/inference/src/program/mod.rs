@@ -9,16 +9,16 @@ mod library;
 
 use std::ffi::OsString;
 use std::fs::File;
-use std::io;
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::Parser;
 use gleaner_base::{Exit, Failure};
-use gleaner_jail::{Paths, inference as sandbox, memory};
+use gleaner_jail::{Paths, inference as sandbox};
 use gleaner_protocol::Handover;
-use gleaner_protocol::inference::InferenceServer;
+use gleaner_protocol::inference::{InferenceReport, InferenceServer};
 use gleaner_vitals::start::{reports, stop_socket};
 use gleaner_vitals::{ReportWriter, log};
 use rustix::process::{Signal, set_parent_process_death_signal};
@@ -28,6 +28,7 @@ use crate::backend::{Backend, Backends, OnnxRuntime, RtenBackend};
 use crate::engine::InferenceEngine;
 use crate::engine_error::EngineError;
 use crate::loader::LoadLimits;
+use crate::memory;
 use crate::region::TensorRegion;
 use crate::threads::ModelThreads;
 use args::Args;
@@ -61,6 +62,10 @@ fn start(
     let internal = |what: &'static str| {
         move |error: io::Error| Failure::caused_by(Exit::Internal, what, &error)
     };
+    let mut reports = reports().map_err(internal("cannot set up the report stream"))?;
+    // Before all that may take long: the starter ends a process that sends no report.
+    let starting = serde_json::json!(InferenceReport::Starting);
+    writeln!(reports, "{starting}").map_err(internal("cannot send a report"))?;
     let library = library::find(args.ort_lib.as_deref());
     let named = named_folders(std::env::var_os("LD_LIBRARY_PATH"));
     let machine = library.as_deref().map(|it| gpu::describe(Path::new("/"), it, &named));
@@ -76,7 +81,6 @@ fn start(
         .map_err(internal("cannot watch for the starter's death"))?;
     let stop = stop_socket().map_err(internal("cannot handle SIGTERM"))?;
     let (control, running) = connections()?;
-    let reports = reports().map_err(internal("cannot set up the report stream"))?;
     // Not without seals: a lambda could take memory away while it is read.
     TensorRegion::create("gleaner-test", 1).map_err(internal("cannot share tensors"))?;
     let onnx_runtime = open(library.as_deref(), machine.unwrap_or_default());

@@ -3,9 +3,11 @@
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-use gleaner_protocol::inference::{InferenceReport, ModelCall, ModelFaultKind, ModelWait};
+use gleaner_protocol::inference::{
+    InferenceReport, ModelCall, ModelFaultKind, ModelMemory, ModelWait,
+};
 
-use crate::onnx::{ANY, FLOAT32, endless, graph, model, node, product, unary, value};
+use crate::onnx::{ANY, FLOAT32, constant, endless, graph, model, node, product, unary, value};
 use crate::support::{
     ModelProgram, ModelUser, TestModel, digest, fault, floats, granted, in_future, wait_for,
 };
@@ -119,11 +121,12 @@ fn models_are_loaded_and_run_beside_a_run_that_does_not_end() {
 }
 
 #[test]
-fn a_model_is_loaded_after_its_trial_and_refused_if_that_failed() {
-    let program = ModelProgram::start(&["--trials"]);
-    let models = [granted("product", product()), granted("relu", unary("Relu", FLOAT32, &[1]))];
+fn a_model_is_loaded_after_its_trial_and_refused_if_that_failed_or_it_does_not_fit() {
+    let program = ModelProgram::start(&["--trials", "--memory", "1048576000"]);
+    let one = |name: &str, op| granted(name, unary(op, FLOAT32, &[1]));
+    let models = [granted("product", product()), one("relu", "Relu"), one("late", "Neg")];
     let mut lambda = program.lambda("any", &models);
-    let mut opened = |name: &str, refused: Option<&str>| {
+    let mut opened = |name: &str, refused: Option<&str>, mib: u64| {
         let (name, lambda) = (name.to_owned(), &mut lambda);
         std::thread::scope(|scope| {
             let opens = scope.spawn(move || lambda.open(&name));
@@ -132,14 +135,35 @@ fn a_model_is_loaded_after_its_trial_and_refused_if_that_failed() {
                 _ => None,
             });
             assert_eq!(program.in_use(), [None, None]);
-            program.control.as_ref().unwrap().tried(&load, refused).unwrap();
+            let memory = ModelMemory { held: mib << 20, peak: mib << 20 };
+            program.control.as_ref().unwrap().tried(&load, refused, memory).unwrap();
             opens.join().unwrap()
         })
     };
-    let message = fault(ModelFaultKind::Failed, opened("product", Some("it ended its process")));
+    let message = fault(ModelFaultKind::Failed, opened("product", Some("it ended its process"), 0));
     assert_eq!(message, "it ended its process");
-    opened("product", None).expect("it is tried again");
-    opened("relu", None).unwrap();
+    // The first one may take all of the 1000 MiB.
+    opened("product", None, 900).expect("it is tried again");
+    let message = fault(ModelFaultKind::Failed, opened("relu", None, 800));
+    let begin = "model `relu.onnx` of lambda `any`: gleaner-inference may take 1000 MiB; ";
+    let numbers = "900 MiB of them by `product.onnx`; this model takes 800 MiB, and 250 MiB are";
+    assert!(message.starts_with(begin) && message.contains(numbers), "{message}");
+    opened("relu", None, 100).unwrap();
+    lambda.run("product", &[floats("x", &[1, 3], &[1.0; 3])]).expect("no process has ended");
+    let late = lambda.open_until("late", Some(Duration::from_millis(500)));
+    let message = fault(ModelFaultKind::Queued, late);
+    assert_eq!(message, "model `late` waits for the trial of its load at the deadline");
+}
+
+#[test]
+fn the_memory_that_a_model_takes_is_measured() {
+    let weights = constant("w", FLOAT32, &[8 << 20], &vec![0; 32 << 20]);
+    let (x, y) = (value("x", FLOAT32, &[1]), value("y", FLOAT32, &[8 << 20]));
+    let sum = model(&graph(&[node("Add", &["x", "w"], &["y"], &[])], &[weights], &[x], &[y]));
+    let program = ModelProgram::start(&[]);
+    program.lambda("any", &[granted("sum", sum)]).open("sum").unwrap();
+    let taken = program.loaded().memory;
+    assert!((32..128).contains(&(taken.held >> 20)) && taken.peak >= taken.held, "{taken:?}");
 }
 
 /// Run it on two cores, with a release build: `taskset -c 0,1 cargo test --release

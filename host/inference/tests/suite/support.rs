@@ -118,7 +118,7 @@ impl ModelProgram {
         }
         let models = models.iter().map(|model| model.grant.clone()).collect();
         let (id, name, memory) = (name.to_owned(), name.to_owned(), MAX_TENSOR_BYTES);
-        let client = AddClient { id, name, demand: self.demand, memory, models };
+        let client = AddClient { id, name, demand: self.demand, pace: None, memory, models };
         control.add_client(&client, socket.as_fd()).unwrap();
     }
 

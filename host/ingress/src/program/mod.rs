@@ -73,12 +73,13 @@ fn start(args: Args) -> Result<(), Failure> {
     // A starter that dies also closes the control connection.
     set_parent_process_death_signal(Some(Signal::TERM))
         .map_err(io::Error::from)
-        .map_err(internal("cannot watch for the starter's death"))?;
+        .map_err(internal("cannot watch for the starter's death by `prctl`"))?;
     let stop = stop_socket().map_err(internal("cannot handle SIGTERM"))?;
     let control = control()?;
     let reports = reports().map_err(internal("cannot set up the report stream"))?;
     // Not without seals: a reader could change what others read.
-    TopicRegion::create("gleaner-test", 1, 1).map_err(internal("cannot share samples"))?;
+    TopicRegion::create("gleaner-test", 1, 1)
+        .map_err(internal("cannot share samples by `memfd_create`"))?;
     let new_sockets = args.new_sockets();
     let source = source::open(args, real_time)?;
     let layers = sandbox::close(layers, new_sockets).map_err(|error| {

@@ -1,12 +1,15 @@
 //! `gleaner-ingress topics`: lists the topics of the network.
 
-use std::io::Write;
-use std::time::{Duration, Instant};
+use std::io::{Read, Write};
+use std::os::unix::net::UnixStream;
+use std::time::Duration;
 
 use clap::Args;
 use gleaner_base::{Exit, Failure};
 use gleaner_dds::{Dds, NetworkArgs};
 use gleaner_protocol::ingress::{IngressReport, TopicInfo};
+use gleaner_vitals::start::stop_socket;
+use rustix::process::{Signal, set_parent_process_death_signal};
 
 use super::network::{NetworkError, warn_of_variables};
 
@@ -33,13 +36,19 @@ pub(super) fn run(args: TopicsArgs, reports: &mut impl Write) -> Result<(), Fail
     })?;
     warn_of_variables();
     let mut options = args.network.options("/gleaner/topics").map_err(NetworkError::failure)?;
+    // Others keep a participant that was killed until its lease ends: each signal, and the end of
+    // the starter, only end the wait.
+    let mut stop = stop_socket()
+        .and_then(|stop| {
+            set_parent_process_death_signal(Some(Signal::TERM))?;
+            let stop = UnixStream::from(stop);
+            stop.set_read_timeout(Some(wait.max(Duration::from_millis(1)))).map(|()| stop)
+        })
+        .map_err(|error| Failure::caused_by(Exit::Internal, "cannot handle signals", &error))?;
     // No samples are received.
     options.largest = 0;
     let dds = Dds::open(options).map_err(NetworkError::failure)?;
-    let until = Instant::now() + wait;
-    while let Some(left) = until.checked_duration_since(Instant::now()) {
-        std::thread::sleep(left);
-    }
+    let _ = stop.read(&mut [0]);
     let seen = dds.discovered().into_iter().map(|topic| TopicInfo {
         topic: topic.topic,
         type_name: topic.type_name,

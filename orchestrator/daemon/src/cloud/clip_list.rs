@@ -3,8 +3,10 @@
 //! Lists and files come from another program: lines are bounded, names have no path in them, and
 //! links are refused.
 
+use std::collections::VecDeque;
 use std::fs::{self, File};
 use std::io::{self, BufRead, BufReader, Read, Seek, SeekFrom};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
@@ -43,6 +45,13 @@ pub(super) struct KnownBuild {
     deployment: String,
 }
 
+/// The newest results of reads of clips: SHA-256 or cause. They outlive connections: a clip that
+/// takes longer to read than any of these lasts would never be announced otherwise.
+pub(super) type ClipReads = VecDeque<(FileIdentity, Result<String, String>)>;
+
+/// Name, length, time of the last change in s and ns, and inode.
+type FileIdentity = (ClipName, u64, i64, i64, u64);
+
 /// A position in the list: the number of bytes before it, and the last line of these.
 struct ListPosition {
     offset: u64,
@@ -80,13 +89,13 @@ impl ClipFolder {
 
     /// Reads the clips after the position that the cloud has, or at the begin of the list if it is
     /// of another one, or only the one with a name; `None` if there are none. One that cannot be
-    /// read has the cause in its facts. `is_over` ends it early.
+    /// read has the cause in its facts.
     pub(super) fn clips(
         &self,
         cursor: Option<&str>,
         only: Option<&ClipName>,
         builds: &[KnownBuild],
-        is_over: &dyn Fn() -> bool,
+        reads: &mut ClipReads,
     ) -> io::Result<Option<ClipReport>> {
         let most = if only.is_some() { 1 } else { CLIPS_IN_REPORT };
         let mut list = match safe_file::read(&self.list()) {
@@ -102,7 +111,7 @@ impl ClipFolder {
         let mut lines = BufReader::new(list);
         let mut report = ClipReport::default();
         let (mut read, mut length) = (0, 0);
-        while report.clips.len() < most && read < READ_MAX && !is_over() {
+        while report.clips.len() < most && read < READ_MAX {
             let mut line = Vec::new();
             lines.by_ref().take(LINE_MAX).read_until(b'\n', &mut line)?;
             // The recorder still writes it, or a power cut tore it.
@@ -114,7 +123,7 @@ impl ClipFolder {
             match clip {
                 Some((name, _)) if only.is_some_and(|only| *only != name) => {}
                 Some((name, clip)) => {
-                    let facts = self.facts(name, clip, builds, is_over)?;
+                    let facts = self.facts(name, clip, builds, reads);
                     let bytes = facts.length();
                     if !report.clips.is_empty() && length + bytes > CLIP_REPORT_MAX - CLIP_FACTS_MAX
                     {
@@ -132,8 +141,7 @@ impl ClipFolder {
         if only.is_some() {
             report.cursor = None;
         }
-        // What was not read to its end is read again.
-        Ok((report != ClipReport::default() && !is_over()).then_some(report))
+        Ok((report != ClipReport::default()).then_some(report))
     }
 
     fn facts(
@@ -141,17 +149,16 @@ impl ClipFolder {
         name: ClipName,
         clip: Clip,
         builds: &[KnownBuild],
-        is_over: &dyn Fn() -> bool,
-    ) -> io::Result<ClipFacts> {
+        reads: &mut ClipReads,
+    ) -> ClipFacts {
         let mut bytes = clip.bytes.min(CLIP_MAX);
         let read = self.open(&name).and_then(|file| {
-            bytes = file.length();
-            digest(file, is_over)
+            bytes = file.metadata()?.len();
+            known_digest(reads, &name, file)
         });
         let (digest, unreadable) = match read {
             Ok(digest) => (Some(digest), None),
             Err(error) if is_gone(&error) => (None, None),
-            Err(error) if is_over() => return Err(error),
             // A bad block of one file must not keep the others from the cloud.
             Err(error) => (None, Some(error.to_string())),
         };
@@ -195,7 +202,7 @@ impl ClipFolder {
             unreadable,
         };
         facts.shorten();
-        Ok(facts)
+        facts
     }
 
     fn path(&self, name: &ClipName, suffix: &str) -> io::Result<PathBuf> {
@@ -206,12 +213,18 @@ impl ClipFolder {
         }
     }
 
-    fn open(&self, name: &ClipName) -> io::Result<PlainFile> {
+    fn open(&self, name: &ClipName) -> io::Result<File> {
+        let path = self.path(name, ".mcap")?;
         #[cfg(test)]
-        if self.path(name, ".bad")?.exists() {
-            return Err(io::Error::from_raw_os_error(5));
+        if path.with_extension("bad").exists() {
+            // Reads fail, as they do at a bad block.
+            return File::options().write(true).open(path);
         }
-        PlainFile::result(&self.path(name, ".mcap")?, ByteSize::new(CLIP_MAX))
+        #[cfg(test)]
+        while path.with_extension("slow").exists() {
+            sleep(Duration::from_millis(1));
+        }
+        Ok(PlainFile::result(&path, ByteSize::new(CLIP_MAX))?.into_file())
     }
 
     /// Reads at most `most` bytes of a clip, which has `bytes`, from the byte `begin` on.
@@ -226,10 +239,10 @@ impl ClipFolder {
         bytes: u64,
         (begin, most): (u64, u64),
     ) -> io::Result<Vec<u8>> {
-        let file = self.open(name)?;
-        let length = ClipFacts::piece_length(bytes, begin).filter(|_| file.length() == bytes);
+        let mut file = self.open(name)?;
+        let found = file.metadata()?.len();
+        let length = ClipFacts::piece_length(bytes, begin).filter(|_| found == bytes);
         let length = length.ok_or(io::ErrorKind::UnexpectedEof)?.min(most);
-        let mut file = file.into_file();
         file.seek(SeekFrom::Start(begin))?;
         let mut content = vec![0; length as usize];
         file.read_exact(&mut content)?;
@@ -262,17 +275,29 @@ fn name(path: &Path, suffix: &str) -> Option<ClipName> {
     path.to_str()?.strip_prefix("clips/")?.strip_suffix(suffix)?.parse().ok()
 }
 
+/// Returns the SHA-256 of a file, which is read unless the result is known.
+fn known_digest(reads: &mut ClipReads, name: &ClipName, file: File) -> io::Result<String> {
+    let found = file.metadata()?;
+    let (bytes, inode) = (found.len(), found.ino());
+    let identity = (name.clone(), bytes, found.mtime(), found.mtime_nsec(), inode);
+    if let Some((_, result)) = reads.iter().find(|(known, _)| *known == identity) {
+        return result.clone().map_err(io::Error::other);
+    }
+    let result = digest(file.take(bytes)).map_err(|error| error.to_string());
+    // Those of a report that was not acknowledged stay.
+    reads.truncate(2 * CLIPS_IN_REPORT);
+    reads.push_front((identity, result.clone()));
+    result.map_err(io::Error::other)
+}
+
 /// Reads a file slowly; returns its SHA-256.
-fn digest(mut file: PlainFile, is_over: &dyn Fn() -> bool) -> io::Result<String> {
+fn digest(mut file: impl Read) -> io::Result<String> {
     let (mut sha256, mut piece) = (Sha256::new(), vec![0; PIECE]);
     let (begin, mut bytes) = (Instant::now(), 0.0);
     loop {
         let read = file.read(&mut piece)?;
         if read == 0 {
             return Ok(hex(&sha256.finalize()));
-        }
-        if is_over() {
-            return Err(io::ErrorKind::Interrupted.into());
         }
         sha256.update(&piece[..read]);
         bytes += read as f64;

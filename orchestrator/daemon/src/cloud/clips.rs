@@ -2,9 +2,10 @@
 //!
 //! The cloud keeps the position up to which clips were announced, and the number of bytes that it
 //! has of each file: this goes on wherever a kill has interrupted it, and `tracker` only counts
-//! attempts, pauses and bytes. One file is sent at a time, in pieces that adapt to the link. A clip
-//! that cannot be read or sent keeps no other one back. Nothing here writes to the folder of clips
-//! or deletes from it.
+//! attempts, pauses and bytes. Clips are read to be announced whether the connection lasts or not,
+//! and the next one uses the result. One file is sent at a time, in pieces that adapt to the link.
+//! A clip that cannot be read or sent keeps no other one back. Nothing here writes to the folder of
+//! clips or deletes from it.
 
 use std::convert::Infallible;
 use std::io;
@@ -20,7 +21,7 @@ use tokio::time::sleep;
 use super::clip_list::{ClipFolder, is_gone, known_builds};
 use super::http::{CloudHttp, PATIENCE};
 use crate::core::Core;
-use tracker::ClipKey;
+use tracker::{AGAIN_FACTOR, ClipKey};
 
 mod tracker;
 
@@ -44,7 +45,7 @@ pub(super) struct ClipSender {
     pub(super) wanted: watch::Receiver<u64>,
     pub(super) tracker: Arc<Mutex<ClipTracker>>,
     /// The file of which something is sent now.
-    current: Option<ClipKey>,
+    current: ClipKey,
 }
 
 impl ClipSender {
@@ -64,17 +65,16 @@ impl ClipSender {
             let Err(failure) = self.serve().await;
             tracing::debug!("clips cannot be sent to the cloud now: {failure}");
             let current = self.current.take();
-            let (pause, event) = self.tracked(|it| it.fail(current, &failure));
-            self.warn(event);
-            sleep(pause).await;
+            sleep(self.tracked(|it| it.fail(current, &failure))).await;
         }
     }
 
     /// Announces and sends until something fails.
     async fn serve(&mut self) -> Result<Infallible, Failure> {
-        let mut length = None;
         loop {
             self.wanted.borrow_and_update();
+            self.begin(None);
+            let mut length = None;
             let mut orders = self.report(&ClipReport::default()).await?;
             let until = Instant::now() + ORDERS_INTERVAL;
             loop {
@@ -84,9 +84,10 @@ impl ClipSender {
                     match self.new_clips(&orders).await? {
                         Some(report) => {
                             orders = self.report(&report).await?;
-                            // Else the same clips would be read again, without an end.
+                            // Else the same clips would be announced again, without an end.
                             if orders.cursor != report.cursor {
-                                return Err(not_stored());
+                                let message = "the cloud did not store the list of clips";
+                                return Err(Failure::new(Exit::Unreachable, message));
                             }
                         }
                         None => {
@@ -97,9 +98,9 @@ impl ClipSender {
                 } else if let Some(new) = self.clip_again(&orders).await? {
                     orders = new;
                 } else if let Some((file, wanted)) = self.tracked(|it| it.next()) {
-                    self.begin(file.clone());
+                    self.begin(Some((file.clone(), wanted.is_none())));
                     orders = match wanted {
-                        None => self.send_thumbnail(&file.0).await?,
+                        None => self.send_thumbnail(&file).await?,
                         Some(wanted) => self.send_piece(&wanted).await?.unwrap_or(orders),
                     };
                     self.current = None;
@@ -123,8 +124,8 @@ impl ClipSender {
     }
 
     fn begin(&mut self, file: ClipKey) {
-        self.tracked(|it| it.attempt(file.clone()));
-        self.current = Some(file);
+        self.warn(self.tracked(|it| it.attempt(file.clone())));
+        self.current = file;
     }
 
     fn warn(&self, event: Option<String>) {
@@ -140,7 +141,7 @@ impl ClipSender {
     async fn send_thumbnail(&self, name: &ClipName) -> Result<ClipOrders, Failure> {
         let path = format!("/v1/clips/{name}/thumbnail");
         let (folder, of) = (self.folder.clone(), name.clone());
-        match in_background(move |_| folder.thumbnail(&of)).await {
+        match in_background(move || folder.thumbnail(&of)).await {
             Ok(image) => self.send(&path, image, PATIENCE).await,
             // Without it, the clip is still there, and the next ones go on.
             Err(error) if is_gone(&error) => self.report_gone(name, true, &error).await,
@@ -158,15 +159,14 @@ impl ClipSender {
         };
         let most = self.tracked(ClipTracker::piece);
         let (folder, of) = (self.folder.clone(), name.clone());
-        let looked = Instant::now();
-        let read = in_background(move |_| folder.piece(&of, bytes, (begin, most))).await;
+        let read = in_background(move || folder.piece(&of, bytes, (begin, most))).await;
         let content = match read {
             Ok(content) => content,
             Err(error) if is_gone(&error) => {
                 return self.report_gone(&name, false, &error).await.map(Some);
             }
             Err(error) => {
-                self.not_read(&name, &error.to_string(), looked.elapsed());
+                self.not_read(&name, &error.to_string()).await;
                 return Ok(None);
             }
         };
@@ -199,20 +199,19 @@ impl ClipSender {
         is_thumbnail: bool,
         error: &io::Error,
     ) -> Result<ClipOrders, Failure> {
-        let gone = GoneClip { name: name.clone(), is_thumbnail, reason: reason_of(error) };
+        let reason = match error.kind() {
+            io::ErrorKind::NotFound => "the vehicle has deleted the file".to_owned(),
+            _ => error.to_string(),
+        };
+        let gone = GoneClip { name: name.clone(), is_thumbnail, reason };
         self.report(&ClipReport { gone: vec![gone], ..ClipReport::default() }).await
     }
 
     async fn new_clips(&self, orders: &ClipOrders) -> Result<Option<ClipReport>, Failure> {
-        let (core, folder) = (Arc::clone(&self.core), self.folder.clone());
-        let cursor = orders.cursor.clone();
-        let read = in_background(move |is_over| {
-            folder.clips(cursor.as_deref(), None, &known_builds(&core), is_over)
-        });
-        let report = read.await.map_err(|error| unreadable(&error))?;
+        let report = self.read(orders.cursor.clone(), None).await?;
         for facts in report.iter().flat_map(|it| &it.clips) {
             if let Some(cause) = &facts.unreadable {
-                self.not_read(&facts.name, cause, Duration::ZERO);
+                self.warn(self.tracked(|it| it.not_read(&facts.name, cause)));
             }
         }
         Ok(report)
@@ -221,16 +220,11 @@ impl ClipSender {
     /// Reads an unreadable clip again, if one is due, and announces what is new of it.
     async fn clip_again(&mut self, orders: &ClipOrders) -> Result<Option<ClipOrders>, Failure> {
         let Some(name) = self.tracked(ClipTracker::due) else { return Ok(None) };
-        let (core, folder, of) = (Arc::clone(&self.core), self.folder.clone(), name.clone());
-        let looked = Instant::now();
-        let read = in_background(move |is_over| {
-            folder.clips(None, Some(&of), &known_builds(&core), is_over)
-        });
-        let report = read.await.map_err(|error| unreadable(&error))?;
+        let report = self.read(None, Some(name.clone())).await?;
         let cause = report.iter().flat_map(|it| &it.clips).find_map(|it| it.unreadable.as_ref());
         let is_readable = cause.is_none();
         if let Some(cause) = cause {
-            self.not_read(&name, cause, looked.elapsed());
+            self.not_read(&name, cause).await;
             if orders.wanted.iter().all(|it| it.name != name) {
                 return Ok(None);
             }
@@ -240,16 +234,40 @@ impl ClipSender {
             let gone = vec![GoneClip { name: name.clone(), is_thumbnail: false, reason }];
             ClipReport { gone, ..ClipReport::default() }
         });
-        self.begin((name.clone(), false));
+        self.begin(Some((name.clone(), false)));
         let orders = self.report(&report).await?;
         self.current = None;
         self.tracked(|it| it.announced(&name, is_readable));
         Ok(Some(orders))
     }
 
-    /// Notes that a clip cannot be read, which took so long.
-    fn not_read(&self, name: &ClipName, cause: &str, took: Duration) {
-        self.warn(self.tracked(|it| it.not_read(name, cause, took)));
+    /// Reads clips of the list, also after the end of the connection. One thread of all connections
+    /// does so at a time, and keeps its results for the next one.
+    async fn read(
+        &self,
+        cursor: Option<String>,
+        only: Option<ClipName>,
+    ) -> Result<Option<ClipReport>, Failure> {
+        let reads = self.tracked(|it| Arc::clone(&it.reads));
+        let mut reads = reads.lock_owned().await;
+        let (core, folder) = (Arc::clone(&self.core), self.folder.clone());
+        let read = in_background(move || {
+            let (begin, builds) = (Instant::now(), known_builds(&core));
+            let (reads, again) = &mut *reads;
+            let report = folder.clips(cursor.as_deref(), only.as_ref(), &builds, reads);
+            if only.is_some() {
+                *again = Some(Instant::now() + begin.elapsed() * AGAIN_FACTOR).max(*again);
+            }
+            report
+        });
+        read.await.map_err(|error| unreadable(&error))
+    }
+
+    /// Notes that a clip cannot be read, and forgets what earlier reads of it have found.
+    async fn not_read(&self, name: &ClipName, cause: &str) {
+        self.warn(self.tracked(|it| it.not_read(name, cause)));
+        let reads = self.tracked(|it| Arc::clone(&it.reads));
+        reads.lock().await.0.retain(|((known, ..), _)| known != name);
     }
 }
 
@@ -266,33 +284,20 @@ async fn paced(
     Ok(orders)
 }
 
-fn not_stored() -> Failure {
-    Failure::new(Exit::Unreachable, "the cloud did not store the list of clips")
-}
-
-/// Returns the reason why a file cannot be sent.
-fn reason_of(error: &io::Error) -> String {
-    match error.kind() {
-        io::ErrorKind::NotFound => "the vehicle has deleted the file".to_owned(),
-        _ => error.to_string(),
-    }
-}
-
 fn unreadable(error: &io::Error) -> Failure {
     Failure::caused_by(Exit::Internal, "cannot read the clips of this vehicle", error)
 }
 
-/// Reads in a thread of its own with the lowest priority, which ends soon after this is dropped:
-/// the recorder and the lambdas come first.
+/// Reads in a thread of its own with the lowest priority: the recorder and the lambdas come first.
+/// It goes on if this is dropped.
 async fn in_background<T: Send + 'static>(
-    read: impl FnOnce(&dyn Fn() -> bool) -> io::Result<T> + Send + 'static,
+    read: impl FnOnce() -> io::Result<T> + Send + 'static,
 ) -> io::Result<T> {
     let (result, received) = oneshot::channel();
     std::thread::Builder::new().name("clips".to_owned()).spawn(move || {
         // Linux applies it to the thread. Without it, the rates still hold.
         let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), 19);
-        let read = read(&|| result.is_closed());
-        let _ = result.send(read);
+        let _ = result.send(read());
     })?;
     received.await.map_err(io::Error::other)?
 }

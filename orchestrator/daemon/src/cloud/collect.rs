@@ -160,15 +160,9 @@ mod tests {
             decision(json!([{ "label": "dark" }]), Value::Null),
             decision(json!([]), json!({ "kind": "fuel" })),
             line("decision", Value::Null),
-            line("started", json!({})),
-            line("ended", json!({})),
-            line("gap", json!({})),
-            line("damaged", json!({})),
-            line("lost", json!({})),
-            line("event", json!({})),
-            line("of another version", json!({})),
         ];
-        for line in news {
+        let kinds = ["started", "ended", "gap", "damaged", "lost", "event", "of another version"];
+        for line in kinds.map(|kind| line(kind, json!({}))).into_iter().chain(news) {
             let mut collected = CollectedLines::default();
             collected.add(&log("info"), b"before", start);
             collected.add(&decision(json!([]), Value::Null), b"and this", start);

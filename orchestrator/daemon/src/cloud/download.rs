@@ -126,8 +126,8 @@ impl Download<'_> {
         let (length, sha256) = (self.length, self.sha256.clone());
         let (path, target) = (partial.clone(), self.target.clone());
         let compared = tokio::task::spawn_blocking(move || {
-            let announced = AnnouncedFile::new(length, sha256.as_str());
-            let compared = announced.compare(safe_file::read(&path)?)?;
+            let announced = AnnouncedFile::new(length);
+            let compared = announced.compare(sha256.as_str(), safe_file::read(&path)?)?;
             match &compared {
                 Ok(()) => std::fs::rename(&path, target)?,
                 Err(_) => std::fs::remove_file(&path)?,

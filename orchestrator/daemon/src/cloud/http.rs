@@ -4,7 +4,7 @@ use std::future::Future;
 use std::io;
 use std::iter;
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use axum::body::Bytes;
 use futures_util::{Stream, StreamExt, TryStreamExt};
@@ -22,12 +22,17 @@ use rustls::pki_types::ServerName;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use tokio::net::TcpStream;
-use tokio::time::timeout;
+use tokio::time::{sleep, timeout};
 use tokio_rustls::TlsConnector;
 use tokio_rustls::client::TlsStream;
 
 /// Time to connect, and to wait for the head of an answer or for the next piece of its body.
 pub(super) const PATIENCE: Duration = Duration::from_secs(30);
+
+/// Time for which a busy cloud is asked for a file again, and the shortest pause: all vehicles may
+/// fetch a release at once.
+const BUSY: Duration = Duration::from_secs(1800);
+const BUSY_PAUSE: Duration = Duration::from_secs(if cfg!(test) { 0 } else { 1 });
 
 /// Slowest rate at which a part of a file is sent, in bytes/s.
 const RATE_MIN: u64 = 14_000;
@@ -79,10 +84,6 @@ impl CloudHttp {
     }
 
     /// Sends a request with a body of JSON, and returns the answer.
-    ///
-    /// # Errors
-    ///
-    /// A failure if there is none, or it is an error.
     pub(super) async fn post<T: DeserializeOwned>(
         &self,
         path: &str,
@@ -97,10 +98,6 @@ impl CloudHttp {
     }
 
     /// Sends bytes, and returns the answer, which may take so long after them.
-    ///
-    /// # Errors
-    ///
-    /// A failure if there is none, or it is an error.
     pub(super) async fn put<T: DeserializeOwned>(
         &self,
         path: &str,
@@ -122,10 +119,6 @@ impl CloudHttp {
     }
 
     /// Returns the content under a path, at most `most` bytes.
-    ///
-    /// # Errors
-    ///
-    /// A failure if there is none, or it is longer.
     pub(super) async fn get(&self, path: &str, most: u64) -> Result<Vec<u8>, Failure> {
         let answer = self.request(PATIENCE, Method::GET, path, Vec::new()).await?;
         self.whole(answer, most).await
@@ -180,21 +173,35 @@ impl CloudHttp {
         request: request::Builder,
         body: Vec<u8>,
     ) -> Result<Response<Incoming>, Failure> {
-        let failed = |error: hyper::Error| self.unreachable("the connection was lost", &error);
         let request = request
             .body(Full::new(Bytes::from(body)))
             .map_err(|error| self.unreachable("a request to it is invalid", &error))?;
+        let until = Instant::now() + BUSY;
+        loop {
+            let answer = self.answer(patience, &request).await?;
+            let waits = request.method() == Method::GET && Instant::now() < until;
+            let pause = busy(&answer).filter(|_| waits);
+            let Some(pause) = pause else { return self.accepted(answer).await };
+            sleep(pause).await;
+        }
+    }
+
+    async fn answer(
+        &self,
+        patience: Duration,
+        request: &Request<Full<Bytes>>,
+    ) -> Result<Response<Incoming>, Failure> {
+        let failed = |error: hyper::Error| self.unreachable("the connection was lost", &error);
         if let Some(kept) = self.take_kept().await
             && let Ok(answer) = self.sent(kept, patience, request.clone()).await?
         {
-            return self.accepted(answer).await;
+            return Ok(answer);
         }
         let stream = TokioIo::new(self.connect(PATIENCE).await?);
         let (sender, connection) =
             self.in_time("it did not answer", http1::handshake(stream)).await?.map_err(failed)?;
         tokio::spawn(connection);
-        let answer = self.sent(sender, patience, request).await?.map_err(failed)?;
-        self.accepted(answer).await
+        self.sent(sender, patience, request.clone()).await?.map_err(failed)
     }
 
     /// Sends a request over a connection, and keeps that if it is to be kept.
@@ -283,6 +290,13 @@ impl CloudHttp {
         failure.causes = vec![format!("{what}: {error}")];
         failure
     }
+}
+
+/// Returns the pause after which a busy cloud wants to be asked again.
+fn busy(answer: &Response<Incoming>) -> Option<Duration> {
+    let seconds = answer.headers().get(header::RETRY_AFTER)?.to_str().ok()?.parse().ok()?;
+    let is_busy = matches!(answer.status().as_u16(), 429 | 503);
+    is_busy.then(|| Duration::from_secs(seconds).clamp(BUSY_PAUSE, PATIENCE))
 }
 
 /// Returns the pieces of a body; one that does not come in time is an error.

@@ -145,12 +145,10 @@ mod tests {
     #[test]
     fn a_new_deployment_is_deployed_and_one_that_was_followed_is_left_alone() {
         let deploy = Step::Deploy { id: id("a"), wish: wish("1", true, 0), rolls_back: false };
-        assert_eq!(steps(&[wanted("a", "1", true, 0)], &[]), vec![deploy.clone()]);
-        assert_eq!(
-            steps(&[wanted("a", "1", true, 0)], &[("a", Some(wish("0", true, 2)))]),
-            [deploy]
-        );
-        assert_eq!(steps(&[wanted("a", "1", true, 0)], &[("a", Some(wish("1", true, 0)))]), []);
+        let new = [wanted("a", "1", true, 0)];
+        assert_eq!(steps(&new, &[]), vec![deploy.clone()]);
+        assert_eq!(steps(&new, &[("a", Some(wish("0", true, 2)))]), [deploy]);
+        assert_eq!(steps(&new, &[("a", Some(wish("1", true, 0)))]), []);
         assert_eq!(steps(&[wanted("a", "1", false, 0)], &[]), []);
     }
 
@@ -182,12 +180,11 @@ mod tests {
     fn what_is_stopped_is_started_by_its_deployment() {
         let running = [("a", Some(wish("1", true, 0)))];
         let stop = Step::Stop(id("a"), wish("1", false, 0));
-        assert_eq!(steps(&[wanted("a", "1", false, 0)], &running), [stop]);
+        assert_eq!(steps(&[wanted("a", "1", false, 0)], &running), std::slice::from_ref(&stop));
         let stopped = [("a", Some(wish("1", false, 0)))];
         let start = Step::Deploy { id: id("a"), wish: wish("1", true, 0), rolls_back: false };
         assert_eq!(steps(&[wanted("a", "1", true, 0)], &stopped), [start]);
         // Its fallback is requested at the stop or later: it is what starts.
-        let stop = Step::Stop(id("a"), wish("1", false, 0));
         assert_eq!(steps(&[wanted("a", "1", false, 1)], &running), [stop]);
         assert_eq!(steps(&[wanted("a", "1", false, 1)], &stopped), []);
         let start = Step::Deploy { id: id("a"), wish: wish("1", true, 1), rolls_back: true };

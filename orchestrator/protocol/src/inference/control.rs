@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use super::{INFERENCE, TryLoad};
+use super::{INFERENCE, ModelMemory, TryLoad};
 use crate::link::frame::{self, tag};
 use crate::link::{
     FrameReceiver, Incoming, LinkError, ReceivedFrame, STARTER, send_frame, send_json,
@@ -83,6 +83,9 @@ pub struct AddClient {
     pub name: String,
     /// The time of models in a wake that it has stated, in ns.
     pub demand: Option<u64>,
+    /// The time of models in a wake, and that from wake to wake, if the latter is stated; in ns.
+    /// Live, its runs wait beyond twice that.
+    pub pace: Option<[u64; 2]>,
     /// Its memory, in bytes: the largest size of its inputs, and of its outputs.
     pub memory: u64,
     /// The models that it may use.
@@ -92,12 +95,13 @@ pub struct AddClient {
 /// A request of the starter.
 #[derive(Debug)]
 pub enum InferenceRequest {
-    /// A model file and its engine, sent before the first lambda that may use it.
+    /// A model file and its engine, sent before each lambda that may use it.
     Model(ModelFile, OwnedFd, Option<OwnedFd>),
     /// A lambda.
     Client(AddClient, OwnedFd),
-    /// A load that it has requested a trial of, and the reason why it must not happen, if any.
-    Tried(TryLoad, Option<String>),
+    /// A load that it has requested a trial of, the reason why it must not happen, if any, and the
+    /// memory that it took.
+    Tried(TryLoad, Option<String>, ModelMemory),
     /// Exit.
     Stop,
 }
@@ -145,13 +149,19 @@ impl InferenceControl {
         send_json(&self.socket, tag::ADD_CLIENT, client, &[socket], INFERENCE)
     }
 
-    /// Sends the result of a trial: the reason why the load must not happen, if there is one.
+    /// Sends the result of a trial: the reason why the load must not happen, if there is one, and
+    /// the memory that it took.
     ///
     /// # Errors
     ///
     /// Those of [`add_model`](Self::add_model).
-    pub fn tried(&self, load: &TryLoad, refused: Option<&str>) -> Result<(), LinkError> {
-        send_json(&self.socket, tag::TRIED_LOAD, &(load, refused), &[], INFERENCE)
+    pub fn tried(
+        &self,
+        load: &TryLoad,
+        refused: Option<&str>,
+        memory: ModelMemory,
+    ) -> Result<(), LinkError> {
+        send_json(&self.socket, tag::TRIED_LOAD, &(load, refused, memory), &[], INFERENCE)
     }
 
     /// Requests the process to exit.
@@ -207,8 +217,8 @@ fn request(mut frame: ReceivedFrame) -> Result<InferenceRequest, LinkError> {
         }
         tag::ADD_CLIENT => Ok(InferenceRequest::Client(frame.json(STARTER)?, frame.descriptor()?)),
         tag::TRIED_LOAD => {
-            let (load, refused) = frame.json(STARTER)?;
-            Ok(InferenceRequest::Tried(load, refused))
+            let (load, refused, memory) = frame.json(STARTER)?;
+            Ok(InferenceRequest::Tried(load, refused, memory))
         }
         tag::STOP => Ok(InferenceRequest::Stop),
         tag => Err(LinkError::Unknown { peer: STARTER, tag }),

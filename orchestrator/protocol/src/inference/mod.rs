@@ -30,8 +30,8 @@ pub use control::{
     ModelFile, engine_file,
 };
 pub use report::{
-    InferenceReport, InferenceStatus, LoadedModel, MODEL_WORKERS, ModelState, NOTE_BYTES, TryLoad,
-    models_in_use,
+    InferenceReport, InferenceStatus, LoadedModel, MODEL_WORKERS, ModelMemory, ModelState,
+    NOTE_BYTES, TryLoad, models_in_use,
 };
 pub use server::{ModelSocket, report_state};
 pub use tensor::{

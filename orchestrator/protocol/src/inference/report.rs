@@ -9,6 +9,8 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "inference", rename_all = "snake_case")]
 pub enum InferenceReport {
+    /// It runs, and opens its libraries.
+    Starting,
     /// It accepts lambdas.
     Ready,
     /// It is about to load a model, and requests a trial in another process first.
@@ -63,6 +65,18 @@ pub struct LoadedModel {
     pub failed: u64,
     /// Time of all runs, in ns.
     pub run_ns: u64,
+    /// Memory that it takes.
+    #[serde(default)]
+    pub memory: ModelMemory,
+}
+
+/// Memory that a model took in a process without others, in bytes; zeros if that is unknown.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ModelMemory {
+    /// After its load and first run.
+    pub held: u64,
+    /// The largest amount until then.
+    pub peak: u64,
 }
 
 /// State of a model.
@@ -96,7 +110,8 @@ pub struct InferenceStatus {
 pub const MODEL_WORKERS: usize = 16;
 
 /// Length of a note of a model in use: the digits of its SHA-256, and, while it runs, a space and
-/// the identity of the lambda. The first note is that of the load; one for each thread follows.
+/// the identity of the lambda; then a line break if others had left it too little memory. The first
+/// note is that of the load; one for each thread follows.
 pub const NOTE_BYTES: usize = 160;
 
 /// Reads the notes of a process that has ended.

@@ -97,15 +97,15 @@ fn models_and_lambdas_arrive_with_their_descriptors() {
         threads: Some(2),
         refused: None,
     };
-    let demand = Some(1);
+    let (demand, pace) = (Some(1), Some([1, 2]));
     let (id, name) = ("front".to_owned(), "yolo".to_owned());
-    let client = AddClient { id, name, demand, memory: 1 << 20, models: vec![model] };
+    let client = AddClient { id, name, demand, pace, memory: 1 << 20, models: vec![model] };
     let load = TryLoad { sha256: file.sha256.clone(), providers: Vec::new(), threads: 1 };
     let (passed, _other) = ModelClient::pair().unwrap();
     control.add_model(&file, passed.as_fd(), None).unwrap();
     control.add_model(&attached, passed.as_fd(), Some(passed.as_fd())).unwrap();
     control.add_client(&client, passed.as_fd()).unwrap();
-    control.tried(&load, Some("it has ended")).unwrap();
+    control.tried(&load, Some("it has ended"), ModelMemory { held: 1, peak: 2 }).unwrap();
     control.stop().unwrap();
     let mut next = || server.poll().unwrap();
     let mut model = |wanted: ModelFile| match next() {
@@ -116,7 +116,8 @@ fn models_and_lambdas_arrive_with_their_descriptors() {
     assert!(model(attached.clone()).is_some());
     assert!(matches!(next(), Incoming::Message(InferenceRequest::Client(it, _)) if it == client));
     let tried = next();
-    assert!(matches!(tried, Incoming::Message(InferenceRequest::Tried(it, Some(_))) if it == load));
+    let Incoming::Message(InferenceRequest::Tried(it, Some(_), memory)) = tried else { panic!() };
+    assert_eq!((it, memory), (load, ModelMemory { held: 1, peak: 2 }));
     assert!(matches!(next(), Incoming::Message(InferenceRequest::Stop)));
     // One of the two is missing.
     control.add_model(&attached, passed.as_fd(), None).unwrap();

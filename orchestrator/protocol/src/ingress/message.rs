@@ -140,6 +140,9 @@ pub enum IngressReport {
     },
 }
 
+/// The multicast group of RTPS for discovery.
+pub const DISCOVERY_GROUP: Ipv4Addr = Ipv4Addr::new(239, 255, 0, 1);
+
 /// A DDS participant, and where it announces itself: enough to announce its end.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct JoinedParticipant {

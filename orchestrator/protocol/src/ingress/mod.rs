@@ -20,8 +20,8 @@ pub use control::{IngressControl, IngressRequest, IngressServer};
 pub use grant::{AddReader, AddTopics, HoldGrant, PublishGrant, TopicGrant};
 pub use grant_check::GrantError;
 pub use message::{
-    AttachedTopic, IngressReport, IngressStatus, IngressTopic, JoinedParticipant, ReaderMessage,
-    RefusedTopic, RegionLayout, SourceStatus, TopicInfo,
+    AttachedTopic, DISCOVERY_GROUP, IngressReport, IngressStatus, IngressTopic, JoinedParticipant,
+    ReaderMessage, RefusedTopic, RegionLayout, SourceStatus, TopicInfo,
 };
 pub use reader::{PUBLISH_MAX, ReaderLink, ReaderRequest};
 pub use source::{Health, Qos, ReceptionStatus};

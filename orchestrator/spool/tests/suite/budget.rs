@@ -115,36 +115,43 @@ fn a_full_queue_refuses_records_and_marks_them() {
 
 #[test]
 fn what_a_full_disk_refused_is_a_gap_and_counted_after_kills() {
-    let disk = SimulatedDisk::new(1);
-    let mut killed = writer(&disk);
-    for _ in 0..3 {
-        killed.append(KIND, TIME, b"kept").unwrap();
+    for seed in 0..40 {
+        let disk = SimulatedDisk::new(seed);
+        let noted = || disk.noted().unwrap().unwrap();
+        let readable = || records(&items(disk.clone()));
+        let mut life = writer(&disk);
+        (0..5).for_each(|_| assert!(life.append(KIND, TIME, b"kept").is_ok()));
+        life.commit().unwrap();
+        disk.set_fault(Some(DiskFault { from: 0, count: u64::MAX, kind: ErrorKind::StorageFull }));
+        let mut appended = 5;
+        for (batch, commits, is_killed) in [(3, 1, seed % 2 == 0), (1, 100, true), (1, 2, false)] {
+            let mut taken = 0;
+            for _ in 0..commits {
+                taken += (0..batch).filter(|_| life.append(KIND, TIME, &[7; 100]).is_ok()).count();
+                life.commit().unwrap_err();
+            }
+            appended += batch * commits;
+            assert_eq!((noted().queued, noted().failing_ns != 0), (taken as u64, true));
+            if is_killed {
+                std::mem::forget(life);
+            } else {
+                drop(life);
+            }
+            assert_eq!(noted().failing_ns != 0, is_killed);
+            // It finds up to two records of the first batch whole, and a part of the next one.
+            life = writer(&disk);
+            let lost = (appended - readable().len()) as u64;
+            assert_eq!((noted().lost + noted().pending, noted().queued), (lost, 0), "seed {seed}");
+        }
+        disk.set_fault(None);
+        life.append(KIND, TIME, b"new").unwrap();
+        life.commit().unwrap();
+        assert_eq!(readable().last_key_value().unwrap().1, b"new");
+        assert!(gaps(&disk).iter().any(|gap| gap.reason == GapReason::DiskFull));
+        let SpoolNote { lost, pending, queued, failing_ns, .. } = noted();
+        let expected = (appended + 1 - readable().len()) as u64;
+        assert_eq!((lost, pending, queued, failing_ns), (expected, 0, 0, 0), "seed {seed}");
     }
-    killed.commit().unwrap();
-    let from = disk.operations();
-    disk.set_fault(Some(DiskFault { from, count: u64::MAX / 2, kind: ErrorKind::StorageFull }));
-    let refused = (0..100).filter(|_| {
-        let refused = killed.append(KIND, TIME, &[7; 100]).is_err();
-        killed.commit().unwrap_err();
-        refused
-    });
-    // The queue has 4 KiB, and a record 140 bytes.
-    assert_eq!(refused.count(), 100 - 29);
-    // Also one that ends before it could write the gap.
-    drop(killed);
-    drop(writer(&disk));
-    disk.set_fault(None);
-    let mut writer = writer(&disk);
-    writer.append(KIND, TIME, b"new").unwrap();
-    writer.commit().unwrap();
-    let found = items(disk.clone());
-    assert_eq!(records(&found).last_key_value().unwrap().1, b"new");
-    let full = gaps(&disk).into_iter().find(|gap| gap.reason == GapReason::DiskFull).unwrap();
-    assert!(full.from < 10 && full.to >= 102, "{full:?}");
-    let note = disk.noted().unwrap().unwrap();
-    let lost = full.to - full.from + 1;
-    assert_eq!((note.lost, note.pending, note.reason), (lost, 0, Some(GapReason::DiskFull)));
-    assert!(!note.is_failing && note.durable == writer.status().next);
 }
 
 #[test]
@@ -180,7 +187,7 @@ fn the_number_of_segments_is_bounded() {
     let open = || SpoolWriter::with_storage(disk.clone(), config(ByteSize::gib(1))).unwrap();
     // Segments of earlier writers, such as those of a program that crashes again and again.
     for seq in 0..6000 {
-        drop(disk.create(seq).unwrap());
+        drop(disk.add(seq));
     }
     let mut writer = open();
     for _ in 0..2 {
@@ -210,25 +217,4 @@ fn a_wrong_name_or_budget_is_refused() {
     assert!(matches!(open(wrong.clone()), SpoolError::Budget { .. }));
     wrong.stream = "x".repeat(65);
     assert!(matches!(open(wrong), SpoolError::Name { .. }));
-}
-
-#[test]
-fn a_reader_follows_a_writer_up_to_the_limit() {
-    let disk = SimulatedDisk::new(1);
-    let mut writer = writer(&disk);
-    let mut reader = SpoolReader::with_storage(disk.clone(), STREAM, None);
-    let mut read = 0;
-    for round in 0..500 {
-        writer.append(KIND, TIME, &[7; 90]).unwrap();
-        reader.set_limit(writer.durable());
-        for item in reader.by_ref() {
-            let SpoolItem::Record(record) = item.unwrap() else { continue };
-            assert!(record.seq < writer.durable());
-            read += 1;
-        }
-        if round % 3 == 2 {
-            writer.commit().unwrap();
-        }
-    }
-    assert!(read >= 498, "{read} records");
 }

@@ -58,7 +58,7 @@ fn with_change(change: impl Fn(&mut Vec<u8>, usize)) {
         for first in disk.firsts().into_iter().filter(|first| *first >= 80) {
             disk.remove(first).unwrap();
         }
-        drop(disk.create(80).unwrap());
+        drop(disk.add(80));
         disk.with_content(80, |content| content.clone_from(&before));
     }
 }
@@ -146,10 +146,10 @@ fn a_torn_tail_is_reported_once_and_then_marked() {
     assert_eq!(reader.by_ref().filter(|item| matches!(item, Ok(SpoolItem::Torn(_)))).count(), 1);
     assert!(reader.next().is_none(), "nothing is new");
     let mut writer = SpoolWriter::with_storage(disk.clone(), config(BUDGET_MIN)).unwrap();
-    assert_eq!(writer.recovered().unwrap().from, 119);
+    assert_eq!((writer.durable(), writer.status().next), (119, 122));
     writer.commit().unwrap();
     let writer = SpoolWriter::with_storage(disk, config(BUDGET_MIN)).unwrap();
-    assert_eq!(writer.recovered(), None);
+    assert_eq!(writer.durable(), writer.status().next);
     let Some(Ok(SpoolItem::Gap(gap))) = reader.next() else { panic!("no gap") };
     assert_eq!((gap.from, gap.reason), (119, GapReason::Torn));
     assert!(reader.next().is_none());
@@ -233,7 +233,7 @@ fn a_segment_that_leaves_too_few_numbers_is_refused_with_its_name() {
     let open = |disk: &SimulatedDisk| SpoolWriter::with_storage(disk.clone(), config(BUDGET_MIN));
     for first in [(1 << 62) + 1, (1 << 63) - 1] {
         let disk = SimulatedDisk::new(3);
-        drop(disk.create(first).unwrap());
+        drop(disk.add(first));
         let error = open(&disk).unwrap_err();
         let name = format!("segment `{first:020}.seg` of stream `logs` leaves too few numbers");
         assert_eq!(error.to_string(), name);
@@ -241,7 +241,7 @@ fn a_segment_that_leaves_too_few_numbers_is_refused_with_its_name() {
     }
     // All that a writer accepts can be read.
     let disk = SimulatedDisk::new(3);
-    drop(disk.create(1 << 62).unwrap());
+    drop(disk.add(1 << 62));
     let mut writer = open(&disk).unwrap();
     writer.append(KIND, TIME, b"one").unwrap();
     assert_eq!(writer.commit().unwrap(), (1 << 62) + 1);

@@ -112,13 +112,12 @@ impl StreamModel {
     /// Commits, and returns whether all was acknowledged.
     pub fn commit<S: SpoolStorage>(&mut self, writer: &mut SpoolWriter<S>) -> bool {
         let committed = writer.commit();
-        let status = writer.status();
         let rest = self.queued.split_off(&writer.durable());
         self.acknowledged.append(&mut self.queued);
         self.queued = rest;
         match committed {
             Ok(durable) => {
-                assert_eq!((durable, status.queued_bytes), (status.next, 0));
+                assert_eq!((durable, writer.queued_bytes()), (writer.status().next, 0));
                 true
             }
             Err(SpoolError::Write { .. }) => false,

@@ -48,6 +48,8 @@ struct Inode {
 struct Disk {
     inodes: Vec<Inode>,
     names: BTreeMap<u64, usize>,
+    /// The file that was created and not published.
+    created: Option<usize>,
     durable_names: BTreeMap<u64, usize>,
     random: SpoolRandom,
     operations: u64,
@@ -103,6 +105,13 @@ impl SimulatedDisk {
         change(&mut disk.inodes[disk.names[&first]].content)
     }
 
+    /// Adds an empty segment, in place of any of its name.
+    pub fn add(&self, first: u64) -> SimulatedFile {
+        let file = self.create().unwrap();
+        self.publish(first).unwrap();
+        file
+    }
+
     pub fn firsts(&self) -> Vec<u64> {
         self.0.borrow().names.keys().copied().collect()
     }
@@ -135,7 +144,7 @@ impl SimulatedDisk {
             inode.content = content;
             inode.durable = inode.content.clone();
         }
-        (disk.durable_names, disk.names) = (names.clone(), names);
+        (disk.durable_names, disk.names, disk.created) = (names.clone(), names, None);
         if disk.random.below(2) == 0 {
             disk.note = None;
         }
@@ -169,13 +178,22 @@ impl SpoolStorage for SimulatedDisk {
         Ok(disk.names.iter().map(|(first, inode)| (*first, length(inode))).collect())
     }
 
-    fn create(&self, first: u64) -> io::Result<SimulatedFile> {
-        self.operation(true)?;
+    /// An empty file needs no space on most file systems.
+    fn create(&self) -> io::Result<SimulatedFile> {
+        self.operation(false)?;
         let disk = &mut *self.0.borrow_mut();
         disk.inodes.push(Inode::default());
         let inode = disk.inodes.len() - 1;
-        disk.names.insert(first, inode);
+        disk.created = Some(inode);
         Ok(SimulatedFile { disk: self.clone(), inode })
+    }
+
+    fn publish(&self, first: u64) -> io::Result<()> {
+        self.operation(true)?;
+        let disk = &mut *self.0.borrow_mut();
+        let inode = disk.created.take().ok_or(io::ErrorKind::NotFound)?;
+        disk.names.insert(first, inode);
+        Ok(())
     }
 
     fn open(&self, first: u64) -> io::Result<SimulatedFile> {
@@ -230,7 +248,8 @@ impl SegmentFile for SimulatedFile {
 
     fn is_linked(&self) -> io::Result<bool> {
         self.disk.operation(false)?;
-        Ok(self.disk.0.borrow().names.values().any(|inode| *inode == self.inode))
+        let disk = self.disk.0.borrow();
+        Ok(disk.names.values().chain(&disk.created).any(|inode| *inode == self.inode))
     }
 
     fn read_at(&self, into: &mut [u8], offset: u64) -> io::Result<usize> {

@@ -1,13 +1,13 @@
 //! The models that are refused: those that ended the process several times, each in use alone.
 //!
-//! An end of the process counts against a model only if no other one was in use. If several were,
-//! none is charged; each of the next processes begins with a time in which it uses one at a time,
-//! so that a further end has one cause.
+//! An end of the process counts against a model, and the lambda that ran it, only if no other one
+//! was in use. If several were, none is charged; each of the next processes begins with a time in
+//! which it uses one at a time, so that a further end has one cause.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-use gleaner_protocol::inference::ModelFile;
+use gleaner_protocol::inference::{ModelEngine, ModelFile};
 
 use super::INFERENCE;
 
@@ -21,7 +21,8 @@ const COUNTED: Duration = Duration::from_secs(24 * 3600);
 /// it, so that a model that fails only beside others cannot end the process again and again.
 const APART: Duration = Duration::from_secs(60);
 
-/// The ends so far, by the digest of the model and, if it ran, the identity of the lambda.
+/// The ends so far, by the digest of the model and, if it ran, a space and the identity of the
+/// lambda; and by these two alone.
 #[derive(Default)]
 pub(super) struct Blame {
     ends: BTreeMap<String, Vec<Instant>>,
@@ -30,9 +31,44 @@ pub(super) struct Blame {
 }
 
 impl Blame {
+    /// Charges the end of a process, if it `is_fault`, to the model that alone was in use by its
+    /// notes. Returns the reason with these models, which `model` finds by their digests, and why
+    /// one is refused from now on.
+    pub(super) fn charge(
+        &mut self,
+        notes: Vec<String>,
+        model: impl Fn(&str) -> Option<ModelFile>,
+        mut reason: String,
+        is_fault: bool,
+    ) -> (String, Option<String>) {
+        let is_short = matches!(&notes[..], [note] if note.ends_with('\n'));
+        let known = |note: String| {
+            let sha256 = note.get(..64).unwrap_or_default().to_owned();
+            let (path, engine) = ("of a lambda that has ended".to_owned(), ModelEngine::None);
+            let model = model(&sha256).unwrap_or(ModelFile { sha256, path, engine });
+            (note.trim_end().to_owned(), model)
+        };
+        let in_use: Vec<_> = notes.into_iter().map(known).collect();
+        for (index, (note, model)) in in_use.iter().enumerate() {
+            let begin = if index == 0 { ", while it" } else { " and" };
+            let verb = if note.contains(' ') { "ran" } else { "loaded" };
+            reason += &format!("{begin} {verb} `{}`", model.path);
+        }
+        let charged = if is_fault && !is_short { &in_use[..] } else { &[] };
+        let refusal = self.ended(charged, &reason, Instant::now());
+        if is_fault && is_short {
+            reason += ": others had left it too little memory: none is charged";
+        }
+        if charged.len() > 1 {
+            let seconds = self.apart_for().as_secs();
+            reason += &format!(": none is charged; for {seconds} s, one runs at a time");
+        }
+        (reason, refusal)
+    }
+
     /// Counts an end of a process by the models `in_use`, each with its note; there are none if it
     /// was ended from outside. Returns why the only one is refused now, if so.
-    pub(super) fn ended(
+    fn ended(
         &mut self,
         in_use: &[(String, ModelFile)],
         reason: &str,
@@ -42,18 +78,26 @@ impl Blame {
             self.apart = self.apart.saturating_mul(2).max(APART);
         }
         let [(culprit, model)] = in_use else { return None };
-        let ends = self.ends.entry(culprit.clone()).or_default();
-        ends.retain(|at| now.duration_since(*at) < COUNTED);
-        ends.push(now);
-        if ends.len() < ENDS_MAX {
-            return None;
-        }
-        let how = match culprit.split_once(' ') {
-            Some((_, lambda)) => format!("only this ran, for lambda `{lambda}`"),
-            None => "only this was loaded".to_owned(),
+        let mut is_refused = |culprit: &str| {
+            let ends = self.ends.entry(culprit.to_owned()).or_default();
+            ends.retain(|at| now.duration_since(*at) < COUNTED);
+            ends.push(now);
+            ends.len() >= ENDS_MAX
+        };
+        // It may have many models, each of which ends the process once.
+        let of_lambda = culprit.find(' ').map(|at| &culprit[at..]).filter(|key| is_refused(key));
+        let (key, how) = match (is_refused(culprit), culprit.split_once(' ')) {
+            (true, Some((_, lambda))) => {
+                (&**culprit, format!("only this ran, for lambda `{lambda}`"))
+            }
+            (true, None) => (&**culprit, "only this was loaded".to_owned()),
+            (false, _) => {
+                let key = of_lambda?;
+                (key, format!("only models of lambda `{}` ran, all refused now", key.trim_start()))
+            }
         };
         let refusal = refusal(model, &format!("{ENDS_MAX} times while {how}"), reason);
-        self.refused.insert(culprit.clone(), refusal.clone());
+        self.refused.insert(key.to_owned(), refusal.clone());
         Some(refusal)
     }
 
@@ -64,8 +108,8 @@ impl Blame {
 
     /// Returns why the lambda of this identity must not use a model.
     pub(super) fn refusal(&self, sha256: &str, lambda: &str) -> Option<&String> {
-        let of_lambda = || self.refused.get(&format!("{sha256} {lambda}"));
-        self.refused.get(sha256).or_else(of_lambda)
+        let keys = [sha256.to_owned(), format!("{sha256} {lambda}"), format!(" {lambda}")];
+        keys.iter().find_map(|key| self.refused.get(key))
     }
 }
 
@@ -82,8 +126,6 @@ pub(super) fn refusal(model: &ModelFile, ended: &str, reason: &str) -> String {
 
 #[cfg(test)]
 mod tests {
-    use gleaner_protocol::inference::ModelEngine;
-
     use super::*;
 
     fn end(blame: &mut Blame, in_use: &[&str], now: Instant) -> Option<String> {
@@ -106,6 +148,31 @@ mod tests {
         assert_eq!(blame.refusal("a", "victim"), None, "it uses the same file");
         (0..3).for_each(|_| drop(end(&mut blame, &["a"], now)));
         assert!(blame.refusal("a", "victim").is_some_and(|it| it.contains("loaded")));
+    }
+
+    #[test]
+    fn a_lambda_whose_models_end_the_process_one_after_another_is_refused_with_all_of_them() {
+        let (mut blame, now) = (Blame::default(), Instant::now());
+        for note in ["a hostile", "a victim", "b hostile", "b victim"] {
+            assert_eq!(end(&mut blame, &[note], now), None);
+        }
+        let refusal = end(&mut blame, &["c hostile"], now).unwrap();
+        assert!(refusal.contains("3 times while only models of lambda `hostile` ran"), "{refusal}");
+        assert_eq!(blame.refusal("d", "hostile"), Some(&refusal), "it has not run yet");
+        assert_eq!(blame.refusal("c", "victim"), None);
+    }
+
+    #[test]
+    fn what_others_had_left_too_little_memory_is_not_charged() {
+        let mut blame = Blame::default();
+        let mut end = |note: &str| {
+            let notes = vec![format!("{} {note}", "1".repeat(64))];
+            blame.charge(notes, |_| None, "it ended".to_owned(), true)
+        };
+        let (reason, _) = end("victim\n");
+        assert!(reason.contains("too little memory: none is charged"), "{reason}");
+        assert!((0..9).all(|_| end("victim\n").1.is_none()));
+        assert!((0..3).any(|_| end("hostile").1.is_some()));
     }
 
     #[test]

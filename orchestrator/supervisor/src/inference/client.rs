@@ -1,16 +1,23 @@
 //! The connection of a lambda's process to `gleaner-inference`.
 
+use std::collections::BTreeMap;
 use std::os::fd::OwnedFd;
 
-use gleaner_protocol::inference::{AddClient, report_state};
+use gleaner_base::{Exit, Failure};
+use gleaner_protocol::inference::{AddClient, ModelClient, report_state};
 use gleaner_protocol::link::LinkError;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
+
+use super::INFERENCE;
+use super::passed_model::PassedModel;
 
 /// A lambda's process.
 pub(super) struct Client {
     pub(super) add: AddClient,
     /// The end of `gleaner-inference` of its connection.
     pub(super) socket: OwnedFd,
+    /// The files of its models; once they are checked, one for each digest.
+    pub(super) models: Vec<PassedModel>,
     /// The newest state of the process, while the connection has no room for it.
     unsent: Option<ProcessState>,
 }
@@ -24,8 +31,42 @@ pub(super) enum ProcessState {
 }
 
 impl Client {
-    pub(super) fn new(add: AddClient, socket: OwnedFd) -> Self {
-        Self { add, socket, unsent: None }
+    /// Creates a client; also returns the end of the lambda of its connection.
+    pub(super) fn pair(
+        add: AddClient,
+        models: Vec<PassedModel>,
+    ) -> Result<(OwnedFd, Self), Failure> {
+        let (lambda_end, socket) = ModelClient::pair().map_err(|error| {
+            Failure::caused_by(Exit::Internal, format!("cannot connect to `{INFERENCE}`"), &error)
+        })?;
+        Ok((lambda_end, Self { add, socket, models, unsent: None }))
+    }
+
+    /// Returns the file of a model.
+    pub(super) fn file(&self, sha256: &str) -> Option<&PassedModel> {
+        self.models.iter().find(|passed| passed.model.sha256 == sha256)
+    }
+
+    /// Refuses the models whose files have another digest; returns the reasons. Each other process
+    /// has one descriptor for each file that is kept.
+    pub(super) fn check_files(&mut self) -> Vec<String> {
+        let mut refused = BTreeMap::new();
+        for passed in std::mem::take(&mut self.models) {
+            let sha256 = passed.model.sha256.clone();
+            if self.has_ended() || self.file(&sha256).is_some() {
+                continue;
+            }
+            if let Some(reason) = passed.mismatch(&self.add.name) {
+                refused.insert(sha256, reason);
+                continue;
+            }
+            refused.remove(&sha256);
+            self.models.push(passed);
+        }
+        for granted in &mut self.add.models {
+            granted.refused = refused.get(&granted.sha256).cloned();
+        }
+        refused.into_values().collect()
     }
 
     /// Sends a state of the process, at once or once the lambda has read earlier ones. Returns
@@ -66,15 +107,45 @@ impl Client {
 
 #[cfg(test)]
 mod tests {
-    use gleaner_protocol::inference::{ModelClient, ModelResult};
+    use std::io::Write;
+    use std::sync::Arc;
+
+    use gleaner_protocol::inference::{ModelEngine, ModelFile, ModelResult};
 
     use super::*;
 
     #[test]
+    fn a_file_that_is_passed_again_is_not_refused_and_is_kept_once() {
+        let abc = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad";
+        let mut file = tempfile::tempfile().unwrap();
+        file.write_all(b"abc").unwrap();
+        let file = Arc::new(file);
+        let models = [abc, abc, "00"].map(|sha256| {
+            let (sha256, path) = (sha256.to_owned(), "m.onnx".to_owned());
+            let model = ModelFile { sha256, path, engine: ModelEngine::None };
+            PassedModel { model, file: Arc::clone(&file), engine: None }
+        });
+        let add = r#"{"id": "", "name": "any", "memory": 0, "models":
+            [{"name": "m", "sha256": "00", "providers": []}]}"#;
+        for _ in 0..2 {
+            let add = serde_json::from_str(add).unwrap();
+            let (_lambda, mut client) = Client::pair(add, models.to_vec()).unwrap();
+            let reason = client.check_files().concat();
+            let begin = format!(
+                "model `m.onnx` of lambda `any` is refused: the file has the SHA-256 {abc}"
+            );
+            assert!(reason.starts_with(&begin), "{reason}");
+            assert_eq!(
+                (client.add.models[0].refused.as_ref(), client.models.len()),
+                (Some(&reason), 1)
+            );
+        }
+    }
+
+    #[test]
     fn a_lambda_that_does_not_read_keeps_its_connection_and_reads_the_last_state_at_the_end() {
-        let (lambda, socket) = ModelClient::pair().unwrap();
         let add = AddClient { name: "busy".to_owned(), ..AddClient::default() };
-        let mut client = Client::new(add, socket);
+        let (lambda, mut client) = Client::pair(add, Vec::new()).unwrap();
         while !client.has_unsent() {
             assert!(client.report(ProcessState::Ended("it has ended".to_owned())));
         }

@@ -1,13 +1,16 @@
 //! The models of a lambda, as they are passed to the process.
 
 use std::fs::File;
+use std::io;
+use std::os::unix::fs::FileExt;
 use std::path::Path;
 use std::sync::Arc;
 
-use gleaner_base::{Exit, Failure, PlainFile};
+use gleaner_base::{Exit, Failure, PlainFile, hex};
 use gleaner_lambda::layout::FILE_MAX;
 use gleaner_lambda::manifest::ModelSpec;
 use gleaner_protocol::inference::{GrantedModel, ModelEngine, ModelFile};
+use sha2::{Digest, Sha256};
 
 use super::engine;
 
@@ -49,5 +52,33 @@ impl PassedModel {
         };
         let (file, entry) = (Arc::new(file), entry.map(Arc::new));
         Ok(Self { model: ModelFile { sha256, path, engine }, file, engine: entry })
+    }
+
+    /// Returns why the model is refused for a lambda, if its file has another digest than stated:
+    /// models are shared by their digests, so another lambda's would not be loaded.
+    pub(super) fn mismatch(&self, lambda: &str) -> Option<String> {
+        let ModelFile { sha256: stated, path, .. } = &self.model;
+        let cause = match self.digest() {
+            Ok(found) if found == *stated => return None,
+            Ok(found) => format!("has the SHA-256 {found}, and the manifest states {stated}"),
+            Err(error) => format!("cannot be read: {error}"),
+        };
+        Some(format!(
+            "model `{path}` of lambda `{lambda}` is refused: the file {cause}; correct it, or \
+             `sha256` in lambda.toml, and build the lambda again: gleaner build DIR"
+        ))
+    }
+
+    /// Computes the digest of the file, which takes seconds for a large one. All that have
+    /// the file share its offset, so it is not used.
+    fn digest(&self) -> io::Result<String> {
+        let (mut sha256, mut piece, mut at) = (Sha256::new(), vec![0; 64 << 10], 0);
+        while at < FILE_MAX.bytes()
+            && let length @ 1.. = self.file.read_at(&mut piece, at)?
+        {
+            sha256.update(&piece[..length]);
+            at += length as u64;
+        }
+        Ok(hex(&sha256.finalize()))
     }
 }

@@ -1,4 +1,5 @@
-//! The process, and how long it may be without a report: it sends one every 5 s.
+//! The process. It sends a report when it starts, another one when its libraries are open, and then
+//! one every 5 s at least.
 
 use std::os::unix::net::UnixStream;
 use std::process::Child;
@@ -7,7 +8,7 @@ use std::sync::atomic::AtomicU64;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-/// Longest time until the first report: libraries may be read from a slow disk.
+/// Longest time between its first two reports: libraries may be read from a slow disk.
 pub(super) const START: Duration = Duration::from_secs(60);
 
 /// Longest time between two looks at the reports: this program may have stood still itself.

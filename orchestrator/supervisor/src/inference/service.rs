@@ -3,6 +3,7 @@
 //! The socket of a lambda outlives the process: the next one uses the same. A model that ended
 //! several processes is not used again.
 
+use std::cell::Cell;
 use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::fs::File;
@@ -10,19 +11,21 @@ use std::io::{BufReader, Read};
 use std::os::fd::{AsFd, OwnedFd};
 use std::os::unix::net::UnixStream;
 use std::os::unix::process::CommandExt;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::PathBuf;
 use std::process::{Command, ExitStatus, Stdio};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::mpsc::{Sender, channel};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Failure, chain};
-use gleaner_lambda::manifest::Manifest;
+use gleaner_lambda::manifest::{Manifest, ScheduleSpec};
 use gleaner_lambda::{BuildDir, InferenceLimits};
 use gleaner_parts::Parts;
 use gleaner_protocol::inference::{
-    AddClient, InferenceControl, InferenceReport, ModelClient, TryLoad, models_in_use,
+    AddClient, InferenceControl, InferenceReport, ModelMemory, TryLoad, models_in_use,
 };
 use gleaner_protocol::link::LinkError;
 use gleaner_protocol::{Handover, SHUTDOWN_TIMEOUT};
@@ -40,17 +43,17 @@ use crate::process::ended;
 use crate::restart_delay::{SILENCE, ServiceDelays, was_killed};
 
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
-/// Time after which a load is tried again that could not be tried.
-const TRY_AGAIN: Duration = Duration::from_secs(5);
 
-/// The reason why a load must not happen, and the end of that if it could not be tried.
-type TrialResult = (Option<String>, Option<Instant>);
+/// The reason why a load must not happen, if there is one, and the memory that it took.
+type TrialResult = (Option<String>, ModelMemory);
 
 type Events = Arc<dyn Fn(InferenceEvent) + Send + Sync>;
 
 /// The process, over all its restarts. Dropping it ends the process.
 pub struct InferenceService {
     shared: Arc<Shared>,
+    /// Lambdas whose files are to be checked, one lambda at a time.
+    unchecked: Sender<Client>,
     supervisor: Option<JoinHandle<()>>,
 }
 
@@ -65,7 +68,6 @@ struct Shared {
 struct ServiceState {
     /// The connection to the current process; `None` between two.
     control: Option<InferenceControl>,
-    models: Vec<PassedModel>,
     clients: Vec<Client>,
     blame: Blame,
     /// `None` while a trial is in progress.
@@ -105,14 +107,25 @@ impl InferenceService {
         let running = memfd_create("gleaner-running", MemfdFlags::CLOEXEC);
         let running = File::from(running.map_err(|error| failed(&error))?);
         let shared = Arc::new(Shared::default());
-        let (events, totals) = (Arc::new(events), Arc::default());
+        let (events, totals): (Events, _) = (Arc::new(events), Arc::default());
+        let (unchecked, clients) = channel::<Client>();
+        let (of_checks, refused) = (Arc::clone(&shared), Arc::clone(&events));
+        let check = move || {
+            for mut client in clients {
+                let reasons = client.check_files();
+                of_checks.lock().connect(client);
+                reasons.into_iter().for_each(|reason| refused(InferenceEvent::Refused(reason)));
+            }
+        };
+        let checks = thread::Builder::new().name("digests".to_owned()).spawn(check);
+        checks.map_err(|error| failed(&error))?;
         let mut supervisor = Supervisor {
             program,
             limits,
             args,
             shared: Arc::clone(&shared),
             running: Arc::new(running),
-            events,
+            events: Arc::clone(&events),
             totals,
         };
         let child = supervisor.start().map_err(|error| failed(&*error))?;
@@ -120,44 +133,45 @@ impl InferenceService {
             .name("inference".to_owned())
             .spawn(move || supervisor.supervise(child))
             .map_err(|error| failed(&error))?;
-        Ok(InferenceService { shared, supervisor: Some(supervisor) })
+        Ok(InferenceService { shared, unchecked, supervisor: Some(supervisor) })
     }
 
     /// Adds a lambda with this identity, whose build is `build`; returns its end of the connection.
+    /// It is connected once the digests of its files are computed, for which the caller must not
+    /// wait. The lambda waits for the reply to its first call.
     ///
     /// # Errors
     ///
-    /// A failure if the file of a model cannot be opened.
+    /// A failure if the file of a model cannot be opened. One with another digest than stated is
+    /// refused when the lambda opens it.
     pub fn add(&self, id: &str, build: &BuildDir, manifest: &Manifest) -> Result<OwnedFd, Failure> {
-        let models = manifest.models.iter().map(|model| PassedModel::open(model, build.path()));
-        let models: Vec<PassedModel> = models.collect::<Result<_, _>>()?;
+        // A manifest may list one file many times.
+        let files = manifest.models.iter().map(|it| ((it.file.as_path(), it.sha256.as_str()), it));
+        let files = files.collect::<BTreeMap<_, _>>().into_values();
+        let models = files.map(|model| PassedModel::open(model, build.path()));
+        let models = models.collect::<Result<_, _>>()?;
         let (id, name) = (id.to_owned(), manifest.lambda.name.to_string());
-        let demand = manifest.demand.model_time.map(|it| it.as_nanos() as u64);
+        let ns = |time: Duration| time.as_nanos() as u64;
+        let demand = manifest.demand.model_time.map(ns);
+        let rate = manifest.demand.rate_hz.map(|hz| Duration::from_secs_f64(1.0 / hz));
+        let period = match manifest.schedule {
+            ScheduleSpec::Periodic { period } => Some(period),
+            ScheduleSpec::Event { .. } => rate,
+        };
+        let pace = period.map(|it| [demand.unwrap_or(ns(manifest.limits.model_time)), ns(it)]);
         let memory = manifest.limits.memory.bytes();
         let granted = manifest.models.iter().map(granted).collect();
-        self.connect(AddClient { id, name, demand, memory, models: granted }, models)
+        let add = AddClient { id, name, demand, pace, memory, models: granted };
+        let (lambda_end, client) = Client::pair(add, models)?;
+        let ended = |_| Failure::new(Exit::Internal, "the thread that checks models has ended");
+        self.unchecked.send(client).map_err(ended)?;
+        Ok(lambda_end)
     }
 
-    pub(super) fn connect(
-        &self,
-        add: AddClient,
-        models: Vec<PassedModel>,
-    ) -> Result<OwnedFd, Failure> {
-        let (lambda_end, socket) = ModelClient::pair().map_err(|error| {
-            Failure::caused_by(Exit::Internal, format!("cannot connect to `{INFERENCE}`"), &error)
-        })?;
-        let mut state = self.shared.lock();
-        for passed in models {
-            if !state.models.iter().any(|known| known.model.sha256 == passed.model.sha256) {
-                state.pass_model(&passed);
-                state.models.push(passed);
-            }
-        }
-        let client = Client::new(add, socket);
-        // Processes that have ended, such as the one before this, leave their socket here.
-        state.clients.retain(|client| !client.has_ended());
-        state.pass_client(&client);
-        state.clients.push(client);
+    /// Connects a lambda whose file is checked already.
+    pub(super) fn connect(&self, add: AddClient, file: PassedModel) -> Result<OwnedFd, Failure> {
+        let (lambda_end, client) = Client::pair(add, vec![file])?;
+        self.shared.lock().connect(client);
         Ok(lambda_end)
     }
 
@@ -213,16 +227,22 @@ impl ServiceState {
     // An error of the connection means that the process has ended, or does not read and is killed:
     // the next one gets everything again.
 
-    fn pass_model(&mut self, passed: &PassedModel) {
-        let PassedModel { model, file, engine } = passed;
-        let engine = engine.as_ref().map(AsFd::as_fd);
-        self.pass(|control| control.add_model(model, file.as_fd(), engine));
+    fn connect(&mut self, client: Client) {
+        // Processes that have ended, such as the one before this, leave their socket here.
+        self.clients.retain(|client| !client.has_ended());
+        self.pass_client(&client);
+        self.clients.push(client);
     }
 
     fn pass_client(&mut self, client: &Client) {
         let mut add = client.add.clone();
         for model in &mut add.models {
-            model.refused = self.blame.refusal(&model.sha256, &add.id).cloned();
+            let refusal = || self.blame.refusal(&model.sha256, &add.id).cloned();
+            model.refused = model.refused.take().or_else(refusal);
+        }
+        for PassedModel { model, file, engine } in &client.models {
+            let engine = engine.as_ref().map(AsFd::as_fd);
+            self.pass(|control| control.add_model(model, file.as_fd(), engine));
         }
         self.pass(|control| control.add_client(&add, client.socket.as_fd()));
     }
@@ -235,13 +255,9 @@ impl ServiceState {
         }
     }
 
-    /// Passes everything to a process that has started.
+    /// Passes all lambdas to a process that has started.
     fn pass_all(&mut self) {
-        let (models, clients) =
-            (std::mem::take(&mut self.models), std::mem::take(&mut self.clients));
-        models.iter().for_each(|passed| self.pass_model(passed));
-        self.models = models;
-        for mut client in clients {
+        for mut client in std::mem::take(&mut self.clients) {
             if client.report(ProcessState::Started) {
                 self.pass_client(&client);
                 self.clients.push(client);
@@ -292,7 +308,13 @@ impl Supervisor {
                 return;
             }
             state.control = None;
-            let (reason, refusal) = self.blame(&mut state, reason, is_fault);
+            let notes = models_in_use(&self.running);
+            // The notes count once, even if the next process cannot be started.
+            let _ = self.running.set_len(0);
+            let ServiceState { blame, clients, .. } = &mut *state;
+            let file = |sha256: &str| clients.iter().find_map(|client| client.file(sha256));
+            let model = |sha256: &str| file(sha256).map(|passed| passed.model.clone());
+            let (reason, refusal) = blame.charge(notes, model, reason, is_fault);
             let state_of_client = || ProcessState::Ended(reason.clone());
             state.clients.retain_mut(|client| client.report(state_of_client()));
             drop(state);
@@ -377,7 +399,7 @@ impl Supervisor {
                 (seen, since) = (count, now);
             }
             looked = now;
-            is_silent |= now.duration_since(since) > if seen == 0 { START } else { SILENCE };
+            is_silent |= now.duration_since(since) > if seen == 1 { START } else { SILENCE };
             if is_late || is_silent || state.control.is_none() {
                 // It may have ended meanwhile.
                 let _ = process.child.kill();
@@ -390,35 +412,6 @@ impl Supervisor {
         }
         self.totals.lock().unwrap_or_else(PoisonError::into_inner).end_process();
         if is_silent { Err(format!("{INFERENCE} stood still, and was killed")) } else { status }
-    }
-
-    /// Charges the end, if it `is_fault`, to the model that alone was in use. Returns the reason
-    /// with the models in use, and why one is refused from now on.
-    fn blame(
-        &self,
-        state: &mut ServiceState,
-        mut reason: String,
-        is_fault: bool,
-    ) -> (String, Option<String>) {
-        let known = |note: String| {
-            let known = state.models.iter().find(|it| note.starts_with(&it.model.sha256))?;
-            Some((note, known.model.clone()))
-        };
-        let in_use: Vec<_> = models_in_use(&self.running).into_iter().filter_map(known).collect();
-        // The notes count once, even if the next process cannot be started.
-        let _ = self.running.set_len(0);
-        for (index, (note, model)) in in_use.iter().enumerate() {
-            let begin = if index == 0 { ", while it" } else { " and" };
-            let verb = if note.contains(' ') { "ran" } else { "loaded" };
-            reason += &format!("{begin} {verb} `{}`", model.path);
-        }
-        let charged = if is_fault { &in_use[..] } else { &[] };
-        let refusal = state.blame.ended(charged, &reason, Instant::now());
-        if charged.len() > 1 {
-            let seconds = state.blame.apart_for().as_secs();
-            reason += &format!(": none is charged; for {seconds} s, one runs at a time");
-        }
-        (reason, refusal)
     }
 
     /// Reads the reports of the process, and counts them.
@@ -447,44 +440,53 @@ impl Supervisor {
     /// the process that runs then.
     fn try_load(&self, load: TryLoad) {
         let mut state = self.shared.lock();
-        let known = state.models.iter().find(|known| known.model.sha256 == load.sha256);
-        let granted = state.clients.iter().find_map(|client| {
-            let model = client.add.models.iter().find(|model| model.load() == load)?;
-            Some((client.add.clone(), model.clone()))
+        let known = state.clients.iter().find_map(|client| {
+            let mut granted = client.add.models.iter();
+            let granted = granted.find(|it| it.refused.is_none() && it.load() == load)?;
+            Some((client.add.clone(), granted.clone(), client.file(&load.sha256)?.clone()))
         });
-        let (Some(model), Some((add, granted))) = (known.cloned(), granted) else {
+        let Some((add, granted, model)) = known else {
             let why = Some("the model cannot be tried: its lambda has ended");
-            return state.pass(|control| control.tried(&load, why));
+            return state.pass(|control| control.tried(&load, why, ModelMemory::default()));
         };
         match state.trials.get(&load).cloned() {
             Some(None) => return,
-            Some(Some((refused, until))) if until.is_none_or(|at| Instant::now() < at) => {
-                return state.pass(|control| control.tried(&load, refused.as_deref()));
+            Some(Some((refused, memory))) => {
+                return state.pass(|control| control.tried(&load, refused.as_deref(), memory));
             }
-            _ => drop(state.trials.insert(load.clone(), None)),
+            None => drop(state.trials.insert(load.clone(), None)),
         }
         drop(state);
         let (of_thread, of_trial) = (self.clone(), load.clone());
         let run = move || {
             let Supervisor { program, limits, shared, .. } = of_thread.clone();
             let add = AddClient { models: vec![granted], ..add };
-            let trial = LoadTrial { program, limits, add, model };
-            of_thread.end_trial(&of_trial, trial.run(|| shared.lock().stops));
+            let trial = LoadTrial { program, limits, add, model, memory: Cell::default() };
+            // The process waits for the result.
+            let tried = catch_unwind(AssertUnwindSafe(|| trial.run(|| shared.lock().stops)))
+                .unwrap_or_else(|_| Err("the trial of a model failed: see standard error".into()));
+            of_thread.end_trial(&of_trial, tried, trial.memory.get());
         };
         if let Err(error) = thread::Builder::new().name("trial".to_owned()).spawn(run) {
-            self.end_trial(&load, Err(format!("a model cannot be tried: {error}")));
+            let why = format!("a model cannot be tried: {error}");
+            self.end_trial(&load, Err(why), ModelMemory::default());
         }
     }
 
     /// Sends the result of a trial to the process that runs now.
-    fn end_trial(&self, load: &TryLoad, tried: Result<Option<String>, String>) {
+    fn end_trial(
+        &self,
+        load: &TryLoad,
+        tried: Result<Option<String>, String>,
+        memory: ModelMemory,
+    ) {
         let mut state = self.shared.lock();
-        let (refused, until) = match tried.clone() {
-            Ok(refused) => (refused, None),
-            Err(reason) => (Some(reason), Some(Instant::now() + TRY_AGAIN)),
-        };
-        state.pass(|control| control.tried(load, refused.as_deref()));
-        state.trials.insert(load.clone(), Some((refused, until)));
+        let refused = tried.clone().unwrap_or_else(Some);
+        state.pass(|control| control.tried(load, refused.as_deref(), memory));
+        state.trials.remove(load);
+        if tried.is_ok() {
+            state.trials.insert(load.clone(), Some((refused, memory)));
+        }
         drop(state);
         match tried {
             Ok(None) => {}

@@ -2,23 +2,20 @@
 
 use std::collections::BTreeMap;
 
-use gleaner_protocol::inference::{InferenceReport, LoadedModel};
+use gleaner_protocol::inference::{InferenceReport, LoadedModel, TryLoad};
 
 /// Sums of the counts of processes that have ended, and the last reports of the current one.
 #[derive(Default)]
 pub(super) struct ModelTotals {
-    ended: BTreeMap<SessionKey, LoadedModel>,
-    current: BTreeMap<SessionKey, LoadedModel>,
+    ended: BTreeMap<TryLoad, LoadedModel>,
+    current: BTreeMap<TryLoad, LoadedModel>,
 }
-
-/// Digest, providers and threads: what `gleaner-inference` shares among lambdas.
-type SessionKey = (String, Vec<String>, u32);
 
 impl ModelTotals {
     /// Adds the counts of earlier processes to those of a report.
     pub(super) fn add_to(&mut self, report: &mut InferenceReport) {
         match report {
-            InferenceReport::Ready | InferenceReport::Try(_) => {}
+            InferenceReport::Starting | InferenceReport::Ready | InferenceReport::Try(_) => {}
             InferenceReport::Model(model) => self.add_earlier(model),
             InferenceReport::Status(status) => {
                 status.models.iter_mut().for_each(|model| self.add_earlier(model));
@@ -27,7 +24,7 @@ impl ModelTotals {
                 status.models.iter_mut().for_each(|model| self.add_earlier(model));
                 // Those that were not needed again since.
                 self.end_process();
-                let keys: Vec<SessionKey> = status.models.iter().map(key).collect();
+                let keys: Vec<TryLoad> = status.models.iter().map(key).collect();
                 let others = self.ended.iter().filter(|(key, _)| !keys.contains(key));
                 status.models.extend(others.map(|(_, model)| model.clone()));
             }
@@ -58,8 +55,9 @@ impl ModelTotals {
     }
 }
 
-fn key(model: &LoadedModel) -> SessionKey {
-    (model.sha256.clone(), model.providers.clone(), model.threads)
+fn key(model: &LoadedModel) -> TryLoad {
+    let LoadedModel { sha256, providers, threads, .. } = model.clone();
+    TryLoad { sha256, providers, threads }
 }
 
 fn requests(model: &LoadedModel) -> u64 {

@@ -181,7 +181,7 @@ impl RunObserver for Board {
                     InferenceReport::Status(last) | InferenceReport::Ended(last) => {
                         inference.last = Some(Box::new(last));
                     }
-                    InferenceReport::Model(_) | InferenceReport::Try(_) => {}
+                    _ => {}
                 }
             }
             InferenceEvent::Stderr(piece) => self.stderr(&piece),

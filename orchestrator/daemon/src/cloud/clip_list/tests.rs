@@ -29,7 +29,7 @@ fn folder(names: &[&str]) -> (tempfile::TempDir, ClipFolder) {
 }
 
 fn new(clips: &ClipFolder, cursor: Option<&str>) -> Option<ClipReport> {
-    clips.clips(cursor, None, &[], &|| false).unwrap()
+    clips.clips(cursor, None, &[], &mut ClipReads::default()).unwrap()
 }
 
 fn names(report: &Option<ClipReport>) -> Vec<&str> {

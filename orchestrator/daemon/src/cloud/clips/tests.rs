@@ -43,18 +43,23 @@ async fn served(
     let answering = async {
         let mut reports = Vec::new();
         for answer in answers {
-            let mut connection = cloud.accept().await;
-            let request = connection.request().await.unwrap();
-            let (_, body) = request.split_once("\r\n\r\n").unwrap();
-            reports.push(serde_json::from_str(body).unwrap());
-            let body = answer.to_string();
-            let head = format!("200 OK\r\ncontent-length: {}", body.len());
-            connection.answer(&head, body.as_bytes()).await;
+            reports.push(answered(cloud, answer).await);
         }
         reports
     };
     let (Err(failure), reports) = soon(async { tokio::join!(sender.serve(), answering) }).await;
     (reports, failure.to_string())
+}
+
+/// Answers the next request of a vehicle, and returns that.
+async fn answered(cloud: &FakeCloud, answer: &Value) -> ClipReport {
+    let mut connection = cloud.accept().await;
+    let request = connection.request().await.unwrap();
+    let (_, body) = request.split_once("\r\n\r\n").unwrap();
+    let answer = answer.to_string();
+    let head = format!("200 OK\r\ncontent-length: {}", answer.len());
+    connection.answer(&head, answer.as_bytes()).await;
+    serde_json::from_str(body).unwrap()
 }
 
 fn orders(cursor: &Value, thumbnails: Value, wanted: Value) -> Value {
@@ -204,21 +209,65 @@ async fn an_unreadable_clip_is_announced_with_its_cause_and_again_once_it_can_be
     let nothing = orders(&Value::Null, json!([]), json!([]));
     let (reports, _) = served(&cloud, &mut sender, &[nothing.clone(), nothing.clone()]).await;
     let [first, second] = &reports[1].clips[..] else { panic!("{reports:?}") };
-    assert!(first.unreadable.as_ref().is_some_and(|cause| cause.contains("os error 5")));
+    assert!(first.unreadable.as_ref().is_some_and(|cause| cause.contains("os error 9")));
     assert_eq!((second.name.as_str(), &second.unreadable), ("b", &None));
     assert_eq!(sender.tracked(|it| it.status().unreadable), 1);
 
+    // After a restart, only the cloud has noted it.
     fs::remove_file(&bad).unwrap();
-    let listed = orders(&json!(reports[1].cursor), json!([]), json!([]));
-    let (reports, _) = served(&cloud, &mut sender, &[listed, json!("no orders")]).await;
+    sender.tracked(|it| *it = ClipTracker::default());
+    let listed = json!({ "cursor": reports[1].cursor, "thumbnails": [], "wanted": [],
+        "unreadable": ["a"] });
+    let (reports, _) = served(&cloud, &mut sender, &[listed.clone(), json!("no orders")]).await;
     let [again] = &reports[1].clips[..] else { panic!("{reports:?}") };
     assert_eq!((again.name.as_str(), again.sha256.is_some()), ("a", true));
     let status = sender.tracked(|it| it.status());
     assert_eq!((status.unannounced_bytes, status.unreadable), (Some(0), 1), "it was not stored");
-    let current = sender.current.take();
-    assert_eq!(current.as_ref().map(|(name, _)| name.as_str()), Some("a"), "it is to blame");
-    sender.tracked(|it| it.announced(&current.unwrap().0, true));
+    let (current, _) = sender.current.take().unwrap();
+    assert_eq!(current.as_str(), "a", "it is to blame");
+    sender.tracked(|it| it.announced(&current, true));
     assert_eq!(sender.tracked(|it| it.status().unreadable), 0);
+
+    // Then a piece fails, and a connection ends before it has used the result of the next read.
+    let wanted = json!([{ "name": "a", "bytes": 3, "sha256": "", "part": 0, "from": 0 }]);
+    let wanted = orders(&listed["cursor"], json!([]), wanted);
+    fs::write(&bad, "").unwrap();
+    let reads = sender.tracked(|it| Arc::clone(&it.reads));
+    for (it, is_unreadable) in [(&wanted, true), (&wanted, true), (&listed, false)] {
+        assert!(reads.lock().await.1.take().is_some(), "others are not read at once after it");
+        let (reports, _) = served(&cloud, &mut sender, &[it.clone(), json!("no orders")]).await;
+        assert_eq!(reports[1].clips[0].unreadable.is_some(), is_unreadable);
+        if bad.exists() {
+            sender.read(None, Some(current.clone())).await.unwrap();
+            fs::remove_file(&bad).unwrap();
+        }
+    }
+}
+
+#[tokio::test]
+async fn a_clip_that_takes_longer_to_read_than_connections_last_is_announced() {
+    let cloud = FakeCloud::start().await;
+    let (_folder, _wanted, mut sender) = sender(&cloud, &[("a", b"abc")]);
+    let slow = sender.folder.0.join("clips/a.slow");
+    fs::write(&slow, "").unwrap();
+    let nothing = orders(&Value::Null, json!([]), json!([]));
+    let reads = sender.tracked(|it| Arc::clone(&it.reads));
+    for _ in 0..5 {
+        let reading = async {
+            answered(&cloud, &nothing).await;
+            while reads.try_lock().is_ok() {
+                sleep(Duration::from_millis(1)).await;
+            }
+        };
+        tokio::select! { _ = sender.serve() => {}, () = soon(reading) => {} }
+    }
+    let stuck = sender.tracked(|it| it.status().stuck.unwrap());
+    assert_eq!((stuck.name, stuck.attempts, &*stuck.cause), (None, 5, "the connection ended"));
+    fs::remove_file(slow).unwrap();
+    let digest = gleaner_trust::sha256(b"abc").to_string();
+    assert_eq!(soon(reads.lock()).await.0[0].1, Ok(digest.clone()), "no connection is needed");
+    let (reports, _) = served(&cloud, &mut sender, &[nothing.clone(), nothing]).await;
+    assert_eq!(reports[1].clips[0].sha256, Some(digest));
 }
 
 #[tokio::test]
@@ -233,12 +282,13 @@ async fn a_portal_is_named_once_after_some_attempts_with_growing_pauses() {
     };
     let (Err(failure), ()) = soon(async { tokio::join!(sender.serve(), portal) }).await;
     for attempt in 1..=6 {
-        let (pause, event) = sender.tracked(|it| it.fail(None, &failure));
+        let pause = sender.tracked(|it| it.fail(None, &failure));
         assert_eq!(pause, Duration::from_millis(1 << (attempt - 1)));
+        let event = sender.tracked(|it| it.attempt(None));
         assert_eq!(event.is_some(), attempt == 5, "{event:?}");
     }
     let stuck = sender.tracked(|it| it.status().stuck.unwrap());
-    assert_eq!((stuck.name, stuck.attempts), (None, 6));
+    assert_eq!((stuck.name, stuck.attempts), (None, 7));
     assert!(stuck.cause.contains("a portal or proxy is in between"), "{}", stuck.cause);
 }
 
@@ -261,9 +311,9 @@ fn a_clip_without_progress_waits_for_others_and_all_for_the_budget_of_the_next_d
     tracker.learn(&orders, 0);
     assert_eq!(tracker.status().waiting, Some(2));
     let next = |tracker: &mut ClipTracker| {
-        let ((name, is_thumbnail), _) = tracker.next()?;
-        tracker.attempt((name.clone(), is_thumbnail));
-        Some(format!("{name} {is_thumbnail}"))
+        let (name, wanted) = tracker.next()?;
+        tracker.attempt(Some((name.clone(), wanted.is_none())));
+        Some(format!("{name} {}", wanted.is_none()))
     };
     for expected in ["b true", "a false", "b false", "b true"] {
         assert_eq!(next(&mut tracker).as_deref(), Some(expected), "the fewest attempts are first");
@@ -284,4 +334,13 @@ fn a_clip_without_progress_waits_for_others_and_all_for_the_budget_of_the_next_d
     tracker.learn(&ClipOrders { budget: budget(2, true), ..ClipOrders::default() }, 0);
     assert!(tracker.status().paused.unwrap().contains("of today were sent"));
     assert_eq!(tracker.status().waiting, None);
+    for first in [1, 0] {
+        let names = (first..first + 64).map(|name| name.to_string().parse().unwrap());
+        tracker.learn(&ClipOrders { unreadable: names.collect(), ..Default::default() }, 0);
+    }
+    tracker.learn(&ClipOrders { wanted: vec![wanted("0", 0)], ..Default::default() }, 0);
+    assert_eq!(next(&mut tracker), None, "a pulled one is listed first, beside 64 known ones");
+    assert!(tracker.due().is_some());
+    tracker.reads.try_lock().unwrap().1 = Some(Instant::now() + COMPARING);
+    assert_eq!(tracker.due(), None, "reading them must not keep others waiting");
 }

@@ -3,14 +3,16 @@
 
 use std::collections::BTreeMap;
 use std::mem::replace;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use gleaner_base::text::in_words;
 use gleaner_base::{ByteSize, Failure};
-use gleaner_fleet::clips::{CLIP_PART, ClipName, ClipOrders, WantedClip};
+use gleaner_fleet::clips::{CLIP_PART, CLIPS_IN_REPORT, ClipName, ClipOrders, WantedClip};
 use gleaner_protocol::vehicle_api::{ClipsStatus, StuckClip};
+use tokio::sync::Mutex;
 
-use super::super::clip_list::offset;
+use super::super::clip_list::{ClipReads, offset};
 
 /// Pause after a failure; it doubles up to the longest, and progress resets it.
 const PAUSE: Duration = Duration::from_millis(if cfg!(test) { 1 } else { 250 });
@@ -19,13 +21,13 @@ const PAUSE_MAX: Duration = Duration::from_secs(300);
 const PIECE_MIN: u64 = 64 << 10;
 /// Attempts without progress after which it is reported.
 const ATTEMPTS: u64 = 5;
-/// Time after which an unreadable clip is read again, and the least multiple of the time that
-/// reading took: a bad disk must not be read all the time.
+/// Time after which an unreadable clip is read again, and the multiple of the time that this took,
+/// before which none is: neither a bad disk nor many of these clips must keep others waiting.
 const AGAIN: Duration = Duration::from_secs(if cfg!(test) { 0 } else { 20 });
-const AGAIN_FACTOR: u32 = 20;
+pub(super) const AGAIN_FACTOR: u32 = 20;
 
-/// A file of a clip: its name, and whether it is the thumbnail.
-pub(super) type ClipKey = (ClipName, bool);
+/// A file of a clip: its name, and whether it is the thumbnail; `None` is the list of clips.
+pub(super) type ClipKey = Option<(ClipName, bool)>;
 
 #[derive(Default)]
 pub(in super::super) struct ClipTracker {
@@ -33,10 +35,12 @@ pub(in super::super) struct ClipTracker {
     orders: ClipOrders,
     /// Length of the list of clips at the last look.
     length: Option<u64>,
-    /// Attempts since the last progress, by the file; those of the list have no name.
-    tries: BTreeMap<Option<ClipKey>, ClipTries>,
+    /// Attempts since the last progress.
+    tries: BTreeMap<ClipKey, ClipTries>,
     /// Clips that cannot be read, with the time of the next look.
     unread: BTreeMap<ClipName, Instant>,
+    /// Held by the thread that reads clips; with the time before which none is read again.
+    pub(super) reads: Arc<Mutex<(ClipReads, Option<Instant>)>>,
     pause: Option<Duration>,
     piece: u64,
     /// Bytes of pieces and thumbnails that were begun in the day of the budget.
@@ -59,8 +63,16 @@ impl ClipTracker {
         }
         self.pause = None;
         let Self { orders: before, unread, tries, .. } = self;
+        for name in orders.unreadable.iter().take(CLIPS_IN_REPORT) {
+            unread.entry(name.clone()).or_insert_with(|| Instant::now() + AGAIN);
+        }
+        // The cloud lists the others again later, unless it does not know yet that they are bad.
+        if unread.len() > 2 * CLIPS_IN_REPORT {
+            let wants = |name: &ClipName| orders.wanted.iter().any(|it| it.name == *name);
+            unread.retain(|name, _| orders.unreadable.contains(name) || wants(name));
+        }
         tries.retain(|file, _| match file {
-            None => true,
+            None => before.cursor == orders.cursor,
             Some((name, true)) => orders.thumbnails.contains(name),
             Some((name, false)) => {
                 let mut same = orders.wanted.iter().filter(|it| before.wanted.contains(it));
@@ -81,21 +93,35 @@ impl ClipTracker {
 
     /// Returns the file to send next, with what is wanted of it unless it is a thumbnail: of those
     /// that can be read, the most important one of the fewest attempts.
-    pub(super) fn next(&self) -> Option<(ClipKey, Option<WantedClip>)> {
+    pub(super) fn next(&self) -> Option<(ClipName, Option<WantedClip>)> {
         if self.is_spent() {
             return None;
         }
-        let thumbnails = self.orders.thumbnails.iter().map(|name| ((name.clone(), true), None));
+        let tried = self.tries.iter().filter_map(|(key, it)| Some((key.as_ref()?, it.attempts)));
+        let tried: BTreeMap<_, _> = tried.map(|((name, image), it)| ((name, *image), it)).collect();
+        let thumbnails = self.orders.thumbnails.iter().map(|name| (name, None));
         let wanted = self.orders.wanted.iter().filter(|it| !self.unread.contains_key(&it.name));
-        let wanted = wanted.map(|it| ((it.name.clone(), false), Some(it.clone())));
-        thumbnails.chain(wanted).min_by_key(|(file, _)| {
-            self.tries.get(&Some(file.clone())).map_or(0, |tries| tries.attempts)
-        })
+        let all = thumbnails.chain(wanted.map(|it| (&it.name, Some(it))));
+        let next = all.min_by_key(|(name, wanted)| tried.get(&(*name, wanted.is_none())));
+        next.map(|(name, wanted)| (name.clone(), wanted.cloned()))
     }
 
-    /// Counts an attempt as it begins: it may be cut off with its task.
-    pub(super) fn attempt(&mut self, file: ClipKey) {
-        self.tries(Some(file)).attempts += 1;
+    /// Counts an attempt as it begins, since it may be cut off with its task; returns the text of
+    /// an event if those before it made no progress.
+    pub(super) fn attempt(&mut self, file: ClipKey) -> Option<String> {
+        let what = match &file {
+            None => "the list of clips".to_owned(),
+            Some((name, false)) => format!("clip `{name}`"),
+            Some((name, true)) => format!("the thumbnail of clip `{name}`"),
+        };
+        let tries = self.tries(file);
+        let attempts = tries.attempts;
+        tries.attempts += 1;
+        let is_new = attempts >= ATTEMPTS && !replace(&mut tries.is_reported, true);
+        is_new.then(|| {
+            let cause = &tries.cause;
+            format!("{what} makes no progress to the cloud in {attempts} attempts: {cause}")
+        })
     }
 
     /// Returns the length of the next piece.
@@ -115,48 +141,28 @@ impl ClipTracker {
         self.piece = (piece * 2).min(CLIP_PART);
     }
 
-    /// Notes the failure of an attempt at a file, or at the list; returns the pause before the next
-    /// one, and the text of an event.
-    pub(super) fn fail(
-        &mut self,
-        file: Option<ClipKey>,
-        failure: &Failure,
-    ) -> (Duration, Option<String>) {
-        let what = match &file {
-            None => "the list of clips".to_owned(),
-            Some((name, false)) => format!("clip `{name}`"),
-            Some((name, true)) => format!("the thumbnail of clip `{name}`"),
-        };
-        let cause = in_words(&failure.message, &failure.causes);
-        let is_list = file.is_none();
-        let tries = self.tries(file);
-        // One at a file was counted as it began.
-        tries.attempts += u64::from(is_list);
-        tries.cause.clone_from(&cause);
-        let attempts = tries.attempts;
-        let is_new = attempts >= ATTEMPTS && !replace(&mut tries.is_reported, true);
+    /// Notes the failure of an attempt; returns the pause before the next one.
+    pub(super) fn fail(&mut self, file: ClipKey, failure: &Failure) -> Duration {
+        self.tries(file).cause = in_words(&failure.message, &failure.causes);
         let pause = self.pause.unwrap_or(PAUSE);
         self.pause = Some((pause * 2).min(PAUSE_MAX));
-        let text = format!("{what} makes no progress to the cloud in {attempts} attempts: {cause}");
-        (pause, is_new.then_some(text))
+        pause
     }
 
-    /// Notes that a clip cannot be read, which took so long; returns the text of an event.
-    pub(super) fn not_read(
-        &mut self,
-        name: &ClipName,
-        cause: &str,
-        took: Duration,
-    ) -> Option<String> {
-        let again = Instant::now() + AGAIN.max(took * AGAIN_FACTOR);
-        let is_new = self.unread.insert(name.clone(), again).is_none();
+    /// Notes that a clip cannot be read; returns the text of an event.
+    pub(super) fn not_read(&mut self, name: &ClipName, cause: &str) -> Option<String> {
+        let is_new = self.unread.insert(name.clone(), Instant::now() + AGAIN).is_none();
         is_new.then(|| format!("clip `{name}` cannot be read, and is tried again: {cause}"))
     }
 
-    /// Returns an unreadable clip that is to be read again. It is not due at once after a failure.
+    /// Returns a clip to read again, or with an unused result, but not at once after a failure.
     pub(super) fn due(&mut self) -> Option<ClipName> {
         let now = Instant::now();
-        let (name, at) = self.unread.iter_mut().min_by_key(|(_, at)| **at)?;
+        let (reads, again) = &*self.reads.try_lock().ok()?;
+        let due = self.unread.iter_mut().filter(|(name, _)| {
+            *again <= Some(now) || reads.iter().any(|((known, ..), _)| known == *name)
+        });
+        let (name, at) = due.min_by_key(|(_, at)| **at)?;
         (*at <= now).then(|| {
             *at = now + AGAIN;
             name.clone()
@@ -194,7 +200,7 @@ impl ClipTracker {
         }
     }
 
-    fn tries(&mut self, file: Option<ClipKey>) -> &mut ClipTries {
+    fn tries(&mut self, file: ClipKey) -> &mut ClipTries {
         self.tries.entry(file).or_insert_with(|| ClipTries {
             attempts: 0,
             since: Instant::now(),

@@ -121,11 +121,15 @@ async fn another_range_than_requested_is_refused() {
 }
 
 #[tokio::test]
-async fn a_cloud_that_always_breaks_off_is_not_tried_for_ever() {
+async fn a_cloud_that_breaks_off_is_not_tried_for_ever_and_a_busy_one_longer() {
     let folder = TempDir::new().unwrap();
-    let (done, requests) = download(folder.path(), vec![(WHOLE, ""); 5]).await;
+    let busy = ["429 Busy", "503 Away"];
+    let busy = busy.map(|it| &*format!("{it}\r\nretry-after: 0\r\ncontent-length: 0").leak());
+    let answers = [busy.repeat(3), vec![WHOLE; 5]].concat();
+    let answers = answers.into_iter().map(|it| (it, "")).collect();
+    let (done, requests) = download(folder.path(), answers).await;
     let failure = done.unwrap_err();
-    assert_eq!((failure.exit, requests.len()), (Exit::Unreachable, 5));
+    assert_eq!((failure.exit, requests.len()), (Exit::Unreachable, 6 + 5));
     assert_eq!(names(folder.path()), ["object.partial"], "the next attempt goes on there");
 }
 

@@ -24,6 +24,7 @@ use crate::durable::DurableFile;
 use crate::spools::STREAMS;
 use simulated::{DiskFault, SimulatedDisk};
 
+mod full_disk;
 #[expect(dead_code, reason = "the disk of the tests of `gleaner-spool`")]
 #[path = "../../../../spool/tests/suite/simulated.rs"]
 mod simulated;
@@ -418,7 +419,7 @@ fn unsynced(disk: &SimulatedDisk) -> (SentStream<SimulatedDisk>, Vec<u8>) {
         vehicle.boot(number);
         vehicle.add("lambdas/brake", 0, 5, 5);
         let segment = std::fs::read(vehicle.newest_segment("lambdas/brake")).unwrap();
-        disk.create(u64::from(number) * 5).unwrap().append(&segment).unwrap();
+        disk.add(u64::from(number) * 5).append(&segment).unwrap();
     }
     (SentStream::new(1, SpoolReader::with_storage(disk.clone(), "brake", None)), lines_on(disk))
 }
