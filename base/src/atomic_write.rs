@@ -6,7 +6,6 @@ use crate::safe_file;
 
 /// The file operations of an atomic write, so that tests can let each of them fail.
 pub trait WriteSteps {
-    /// An open file.
     type File;
 
     /// Creates a file in place of any of this name.
@@ -52,7 +51,6 @@ pub trait WriteSteps {
     fn sync_folder(&self, folder: &Path) -> io::Result<()>;
 }
 
-/// The steps on the file system.
 #[derive(Clone, Copy, Debug)]
 pub struct DiskSteps;
 

@@ -28,18 +28,14 @@ pub trait Explain: Error {
 /// `main` prints it on standard error and ends with [`Failure::exit`].
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Failure {
-    /// The exit code of the program.
     pub exit: Exit,
-    /// The failed action.
     pub message: String,
     /// The causes, the nearest first.
     pub causes: Vec<String>,
-    /// Help for the user.
     pub help: Option<String>,
 }
 
 impl Failure {
-    /// Creates a failure without causes.
     pub fn new(exit: Exit, message: impl Into<String>) -> Failure {
         Failure { exit, message: message.into(), causes: Vec::new(), help: None }
     }
@@ -58,7 +54,6 @@ impl Failure {
         failure
     }
 
-    /// Sets the help.
     #[must_use]
     pub fn with_help(mut self, help: impl Into<String>) -> Failure {
         self.help = Some(help.into());

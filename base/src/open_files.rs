@@ -9,7 +9,6 @@ pub fn raise_open_files() {
     let _ = setrlimit(Resource::Nofile, Rlimit { current: maximum, maximum });
 }
 
-/// Returns how many open files this process may have.
 pub fn open_files_max() -> usize {
     let current = getrlimit(Resource::Nofile).current;
     current.and_then(|most| most.try_into().ok()).unwrap_or(usize::MAX)

@@ -19,26 +19,20 @@ use crate::ByteSize;
 /// The reason why a file is refused; the inner error of an [`io::Error`].
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum NotPlain {
-    /// A symbolic link where none is allowed.
     #[error("it is a link")]
     Link,
-    /// A folder, a pipe, a socket or a device.
     #[error("it is not a regular file")]
     NoFile,
-    /// A symbolic link, or a path through one, that leads out of the folder.
     #[error("it is a link to `{}`, outside of `{}`", target.display(), folder.display())]
     Outside {
-        /// The target of the link.
         target: PathBuf,
         /// The folder, with links resolved.
         folder: PathBuf,
     },
-    /// Longer than any file of its kind.
     #[error("it has {bytes} bytes; at most {most} are read")]
     TooLong {
         /// Its length, or the number of bytes read so far.
         bytes: u64,
-        /// The maximum.
         most: ByteSize,
     },
 }
@@ -49,7 +43,6 @@ impl NotPlain {
         error.get_ref()?.downcast_ref()
     }
 
-    /// Help for the user.
     pub fn help(&self) -> String {
         match self {
             Self::Link | Self::NoFile => "put a file in its place, or remove it",

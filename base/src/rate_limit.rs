@@ -17,7 +17,6 @@ impl RateLimit {
         RateLimit { per_s, burst, left: burst, since: None }
     }
 
-    /// Returns how much is left.
     pub fn left(&self, now: Instant) -> f64 {
         let passed = self.since.map_or(0.0, |since| now.duration_since(since).as_secs_f64());
         (self.left + passed * self.per_s).min(self.burst)

@@ -17,13 +17,10 @@ use crate::{Exit, Failure};
 /// [`io::Error`].
 #[derive(Copy, Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum UnsafePath {
-    /// A symbolic link.
     #[error("it is a link")]
     Link,
-    /// A folder, a pipe, a socket or a device.
     #[error("it is not a regular file")]
     NoFile,
-    /// Anything but a folder.
     #[error("it is not a folder")]
     NoFolder,
     /// A file with several hard links: writing to it would change the others, too.
@@ -32,7 +29,6 @@ pub enum UnsafePath {
 }
 
 impl UnsafePath {
-    /// Help for the user.
     pub const HELP: &str = "remove it, or choose another folder: --out DIR";
 
     /// Returns the reason if `error` has one.

@@ -12,7 +12,6 @@ pub fn nanoseconds(duration: Duration) -> i64 {
 
 /// A time of the Gregorian calendar, in UTC.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
-#[allow(missing_docs)]
 pub struct UtcTime {
     pub year: i64,
     pub month: i64,

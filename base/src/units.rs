@@ -13,7 +13,6 @@ use crate::{Exit, Explain};
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("`{text}` is not a {what}")]
 pub struct UnitError {
-    /// The text that was refused.
     pub text: String,
     /// `size` or `duration`.
     pub what: &'static str,
@@ -36,7 +35,6 @@ impl Explain for UnitError {
 pub struct ByteSize(u64);
 
 impl ByteSize {
-    /// `n` bytes.
     pub const fn new(n: u64) -> ByteSize {
         ByteSize(n)
     }
@@ -56,7 +54,6 @@ impl ByteSize {
         ByteSize::mib(n.saturating_mul(1024))
     }
 
-    /// Returns the number of bytes.
     pub const fn bytes(self) -> u64 {
         self.0
     }

@@ -26,7 +26,6 @@ use crate::run::stop_flag;
 /// Provider that has engines.
 const TENSORRT: &str = "tensorrt";
 
-/// Time in which an engine must be built.
 const BUILD_MAX: Duration = Duration::from_secs(3 * 3600);
 
 /// Memory that a build may take. TensorRT needs several times that of the model.
@@ -119,7 +118,6 @@ struct EngineBuild<'a> {
 }
 
 impl EngineBuild<'_> {
-    /// Builds the engine, and puts it into `store`.
     fn run(&self, store: &Path) -> Result<EngineBuilt, Failure> {
         let begin = Instant::now();
         self.show("building its engine, which takes minutes");

@@ -10,7 +10,6 @@ use crate::args::ReportArgs;
 use crate::output::print;
 use crate::separate;
 
-/// File name of the page in the result folder.
 pub(crate) const NAME: &str = "report.html";
 
 pub(crate) fn run(args: &ReportArgs) -> Result<Exit, Failure> {

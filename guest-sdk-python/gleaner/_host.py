@@ -15,21 +15,10 @@ from types import ModuleType, TracebackType
 from typing import Any, Callable, Dict, List, Optional, Tuple
 
 from . import _deadline
-from ._printed import end_call, print_to
+from ._printed import end_call
+from ._printed import print_to as print_to
 from .context import Context
 from .error import DeadlineExceeded
-
-__all__ = [
-    "attempt",
-    "enter_environment",
-    "load",
-    "maker",
-    "numpy_version",
-    "own_modules",
-    "print_to",
-    "settle",
-    "tidy",
-]
 
 Handler = Callable[..., object]
 

@@ -357,7 +357,3 @@ def pixels(given: Dict[str, Any]) -> Calls:
             "resize", lambda shown: made(_pixels.resize(shown, *size)), size
         ),
     }
-
-
-if __name__ == "__main__":
-    unittest.main()

@@ -161,7 +161,3 @@ class WithoutHost(unittest.TestCase):
         with unittest.mock.patch.dict(sys.modules, _gleaner=host):
             result, text, kind = _host.attempt(0.001, endless)
         self.assertEqual((result, kind, left), (None, "deadline", []), text)
-
-
-if __name__ == "__main__":
-    unittest.main()

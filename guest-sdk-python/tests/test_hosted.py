@@ -6,7 +6,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import unittest
 from pathlib import Path
 
 import home
@@ -469,7 +468,3 @@ class Starting(Hosted):
         message = self.refusal(str(self.folder / "lib_gleaner.so"))
         self.assertIn("lib_gleaner.so: cannot open shared object file", message)
         self.assertIn("help:", message)
-
-
-if __name__ == "__main__":
-    unittest.main()

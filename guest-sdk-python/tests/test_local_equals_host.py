@@ -209,7 +209,3 @@ def pictures() -> List[Image]:
         images.append(Image(8, 6, encoding, step, noise.randbytes(step * 6)))
     images.append(Image(8, 6, "mono16", 16, noise.randbytes(96), big_endian=True))
     return images
-
-
-if __name__ == "__main__":
-    unittest.main()

@@ -200,7 +200,3 @@ class Folders(unittest.TestCase):
         command = [sys.executable, "-c", textwrap.dedent(test)]
         ended = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=60)
         self.assertEqual(ended.returncode, 0, ended.stderr)
-
-
-if __name__ == "__main__":
-    unittest.main()

@@ -222,7 +222,3 @@ class Models(unittest.TestCase):
                 Tensor.create("float64", [1 << 17])
 
         self.assertEqual(run(Memory, 2, {"detector": FakeModel()}).faults, [])
-
-
-if __name__ == "__main__":
-    unittest.main()

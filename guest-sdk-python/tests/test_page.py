@@ -36,7 +36,3 @@ class CodeOnPage(unittest.TestCase):
                 path = {**os.environ, "PYTHONPATH": str(home.SDK)}
                 done = subprocess.run(command, cwd=folder, env=path, capture_output=True, text=True)
                 self.assertEqual(done.returncode, 0, done.stdout)
-
-
-if __name__ == "__main__":
-    unittest.main()

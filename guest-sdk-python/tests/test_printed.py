@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import unittest
 
 from hosted import GREY, Hosted
 
@@ -154,7 +153,3 @@ class Printing(Hosted):
                 f"import io, sys\n{statement}\ndef on_event(ctx, event): pass", [GREY, GREY]
             )
             self.assertEqual(self.log(), lines, statement)
-
-
-if __name__ == "__main__":
-    unittest.main()

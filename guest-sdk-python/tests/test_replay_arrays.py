@@ -359,7 +359,3 @@ class Lambdas(unittest.TestCase):
         # The second minute begins at 60 s: 600 samples in the first, then 100.
         self.assertEqual((len(run.triggers), run.triggers_refused), (10, 700 - 10 - run.backed_off))
         self.assertGreater(run.backed_off, 0)
-
-
-if __name__ == "__main__":
-    unittest.main()

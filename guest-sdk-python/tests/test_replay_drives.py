@@ -242,7 +242,3 @@ class Drives(unittest.TestCase):
             writer.write(writer.add_connection("/speed", SPEED, typestore=STORE), 1, b"xy")
         with self.assertRaisesRegex(ReplayError, "a message of `/speed` is not CDR"):
             replay(Speeds, path, manifest=manifest())
-
-
-if __name__ == "__main__":
-    unittest.main()

@@ -97,7 +97,3 @@ class ForeignTopics(unittest.TestCase):
             self.refused(Drive(paths), what, both)
         again = self.write(wheels("/wheels", 5, COMMENTED))
         self.assertEqual(self.left(Drive([first, again])), [1.0, 5.0])
-
-
-if __name__ == "__main__":
-    unittest.main()

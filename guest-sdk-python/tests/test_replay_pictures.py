@@ -82,7 +82,3 @@ class Pictures(unittest.TestCase):
         self.assertEqual(run.faults, [])
         self.assertEqual(read[1], pixels.tobytes())
         self.assertTrue(read[0].endswith(read[1]))
-
-
-if __name__ == "__main__":
-    unittest.main()

@@ -170,7 +170,3 @@ class Definitions(unittest.TestCase):
         self.assertEqual(
             Drive(self.folder / "other").column("/wheels", "wheels[0].speed").values.tolist(), [4.5]
         )
-
-
-if __name__ == "__main__":
-    unittest.main()

@@ -226,7 +226,3 @@ class Agree(unittest.TestCase):
         ]
         _, log = self.both(source, images)
         self.assertEqual(len(log), len(images))
-
-
-if __name__ == "__main__":
-    unittest.main()

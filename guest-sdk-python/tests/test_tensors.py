@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import unittest
 
 from hosted import GREY, Hosted
 
@@ -83,7 +82,3 @@ class Tensors(Hosted):
                 assert kinds == ["wrong-input"] * 8, kinds
         """
         self.replay(source, [GREY])
-
-
-if __name__ == "__main__":
-    unittest.main()

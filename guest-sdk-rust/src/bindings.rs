@@ -2978,6 +2978,8 @@ pub mod gleaner {
       #[allow(unused_unsafe, clippy::all)]
       /// Reports an event: opens the `[record]` window around the sample or tick of this wake.
       /// `score` is the strength of the event, in a unit that the lambda documents.
+      ///
+      /// Errors: `invalid`; `too-many`.
       #[allow(async_fn_in_trait)]
       pub fn event(label: &str,score: f64,attributes: &[Attribute],) -> Result<(),TriggerError>{
         unsafe {
@@ -3078,6 +3080,8 @@ pub mod gleaner {
       #[allow(unused_unsafe, clippy::all)]
       /// Starts a recording that lasts until `stop` is called with the same label. At most 64 labels
       /// of a lambda can be recorded at once.
+      ///
+      /// Errors: `invalid`; `too-many`.
       #[allow(async_fn_in_trait)]
       pub fn start(label: &str,attributes: &[Attribute],) -> Result<(),TriggerError>{
         unsafe {
@@ -3177,6 +3181,8 @@ pub mod gleaner {
       }
       #[allow(unused_unsafe, clippy::all)]
       /// Ends the recording that `start` began with the same label.
+      ///
+      /// Errors: `invalid`; `too-many` for more than 16 triggers in one wake.
       #[allow(async_fn_in_trait)]
       pub fn stop(label: &str,) -> Result<(),TriggerError>{
         unsafe {

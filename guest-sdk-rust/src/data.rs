@@ -7,6 +7,7 @@ pub use crate::bindings::gleaner::lambda::data::Tick;
 pub use crate::bindings::gleaner::lambda::types::{
     Counts, DataError, Encoding, FrameInfo, Guid, Identity, Roi, Stamps, Value,
 };
+pub use crate::error::DataErrorKind;
 use crate::error::into_result;
 use crate::{Error, Result};
 

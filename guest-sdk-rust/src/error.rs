@@ -11,7 +11,7 @@ use crate::bindings::gleaner::lambda::types::DataError;
 /// the lambda does not start.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Error {
-    kind: Option<&'static str>,
+    kind: Option<ErrorKind>,
     message: String,
 }
 
@@ -24,10 +24,15 @@ impl Error {
         Self { kind: None, message: message.into() }
     }
 
-    /// Returns the case of the WIT variant with which the host refused a call, such as `no-room`;
-    /// none for other errors.
-    pub fn kind(&self) -> Option<&'static str> {
+    /// Returns the reason for which the host refused a call; none for other errors.
+    pub fn kind(&self) -> Option<ErrorKind> {
         self.kind
+    }
+
+    /// Returns whether the host refused a call for this reason, such as
+    /// [`ScratchErrorKind::NoSuchEntry`].
+    pub fn is(&self, kind: impl Into<ErrorKind>) -> bool {
+        self.kind == Some(kind.into())
     }
 }
 
@@ -51,9 +56,9 @@ impl<E: std::error::Error> From<E> for Error {
     }
 }
 
-/// An error of the bindings, which has the name of its case in the WIT and a message.
+/// An error of the bindings, which has a message in each case.
 pub(crate) trait HostError {
-    fn into_parts(self) -> (&'static str, String);
+    fn into_parts(self) -> (ErrorKind, String);
 }
 
 /// Converts a result of the bindings. The errors that wit-bindgen generates print as code, so only
@@ -68,48 +73,64 @@ pub(crate) fn refused(error: impl HostError) -> Error {
     Error { kind: Some(kind), message }
 }
 
-impl HostError for DataError {
-    fn into_parts(self) -> (&'static str, String) {
-        match self {
-            Self::NoSuchInput(message) => ("no-such-input", message),
-            Self::NoSuchField(message) => ("no-such-field", message),
-            Self::WrongField(message) => ("wrong-field", message),
-            Self::Malformed(message) => ("malformed", message),
-            Self::NotAFrame(message) => ("not-a-frame", message),
-            Self::NoRoom(message) => ("no-room", message),
-            Self::OutOfRange(message) => ("out-of-range", message),
+/// Generates the kinds of an area: the cases of its error in the WIT, without their messages.
+macro_rules! error_kinds {
+    ($($area:ident: $kind:ident of $error:ident { $($case:ident),+ })+) => {
+        /// The reason for which the host refused a call, by the area of the call.
+        ///
+        /// It prints as the name of the case in the WIT, such as `no-room`.
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+        #[non_exhaustive]
+        pub enum ErrorKind {
+            $(#[doc = concat!("A refusal with a [`", stringify!($error), "`].")] $area($kind),)+
         }
+
+        impl ErrorKind {
+            fn case(self) -> &'static str {
+                match self { $($(Self::$area($kind::$case) => stringify!($case),)+)+ }
+            }
+        }
+
+        $(
+            #[doc = concat!("Case of a [`", stringify!($error), "`], which describes each.")]
+            #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+            #[non_exhaustive]
+            #[allow(missing_docs)]
+            pub enum $kind { $($case),+ }
+
+            impl From<$kind> for ErrorKind {
+                fn from(kind: $kind) -> Self {
+                    Self::$area(kind)
+                }
+            }
+
+            impl HostError for $error {
+                fn into_parts(self) -> (ErrorKind, String) {
+                    // The bindings are generated from the WIT, so a new case does not compile here.
+                    match self { $(Self::$case(message) => ($kind::$case.into(), message)),+ }
+                }
+            }
+        )+
+    };
+}
+
+error_kinds! {
+    Data: DataErrorKind of DataError {
+        NoSuchInput, NoSuchField, WrongField, Malformed, NotAFrame, NoRoom, OutOfRange
+    }
+    Trigger: TriggerErrorKind of TriggerError { Invalid, TooMany }
+    Scratch: ScratchErrorKind of ScratchError { NoRoom, NoSuchEntry, WrongName }
+    Inference: InferenceErrorKind of InferenceError {
+        Unavailable, NoSuchModel, WrongInput, TooSlow, Failed
     }
 }
 
-impl HostError for TriggerError {
-    fn into_parts(self) -> (&'static str, String) {
-        match self {
-            Self::Invalid(message) => ("invalid", message),
-            Self::TooMany(message) => ("too-many", message),
-        }
-    }
-}
-
-impl HostError for ScratchError {
-    fn into_parts(self) -> (&'static str, String) {
-        match self {
-            Self::NoRoom(message) => ("no-room", message),
-            Self::NoSuchEntry(message) => ("no-such-entry", message),
-            Self::WrongName(message) => ("wrong-name", message),
-        }
-    }
-}
-
-impl HostError for InferenceError {
-    fn into_parts(self) -> (&'static str, String) {
-        match self {
-            Self::Unavailable(message) => ("unavailable", message),
-            Self::NoSuchModel(message) => ("no-such-model", message),
-            Self::WrongInput(message) => ("wrong-input", message),
-            Self::TooSlow(message) => ("too-slow", message),
-            Self::Failed(message) => ("failed", message),
-        }
+impl fmt::Display for ErrorKind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.case().char_indices().try_for_each(|(at, letter)| {
+            let dash = if at > 0 && letter.is_ascii_uppercase() { "-" } else { "" };
+            write!(f, "{dash}{}", letter.to_ascii_lowercase())
+        })
     }
 }
 
@@ -119,21 +140,17 @@ mod tests {
 
     #[test]
     fn a_host_error_keeps_its_kind_and_message() {
-        let error =
-            into_result::<()>(Err(DataError::NoRoom("no slot is free".to_owned()))).unwrap_err();
-        assert_eq!(
-            (error.kind(), error.to_string()),
-            (Some("no-room"), "no slot is free".to_owned())
-        );
+        let refused = DataError::NotAFrame("it is a text".to_owned());
+        let error = into_result::<()>(Err(refused)).unwrap_err();
+        assert!(error.is(DataErrorKind::NotAFrame) && !error.is(ScratchErrorKind::NoRoom));
+        assert_eq!(error.kind().unwrap().to_string(), "not-a-frame");
+        assert_eq!(error.to_string(), "it is a text");
     }
 
     #[test]
     fn any_rust_error_is_converted() {
         let parse = || -> Result<i32> { Ok("x".parse::<i32>()?) };
         let error = parse().unwrap_err();
-        assert_eq!(
-            (error.kind(), error.to_string()),
-            (None, "invalid digit found in string".to_owned())
-        );
+        assert_eq!((error.kind(), &*error.to_string()), (None, "invalid digit found in string"));
     }
 }

@@ -30,6 +30,7 @@ pub use crate::bindings::gleaner::lambda::inference::{
 };
 pub use crate::bindings::gleaner::lambda::types::{Placement, Preprocess};
 use crate::data::{Frame, PIECE};
+pub use crate::error::InferenceErrorKind;
 use crate::error::{into_result, refused};
 use crate::{Error, Result};
 

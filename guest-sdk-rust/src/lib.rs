@@ -40,7 +40,20 @@
 //!
 //! The modules [`data`], [`inference`], [`log`], [`scratch`] and [`trigger`] are the interfaces of
 //! the WIT package `gleaner:lambda`. An error in their docs, such as `no-room`, is a case of a WIT
-//! variant; [`Error::kind`] returns its name.
+//! variant; [`Error::kind`] returns it, here as [`data::DataErrorKind::NoRoom`].
+
+#![warn(missing_docs)]
+
+/// Implements `From` for a type with one field.
+macro_rules! conversions {
+    ($target:ident: $($from:ty => |$value:ident| $make:expr),+ $(,)?) => {
+        $(impl From<$from> for $target {
+            fn from($value: $from) -> Self {
+                Self($make)
+            }
+        })+
+    };
+}
 
 // Generated, and compared with what is generated.
 #[cfg(target_family = "wasm")]
@@ -67,7 +80,7 @@ pub mod trigger;
 
 pub use config::{Config, ConfigValue};
 pub use data::{Column, Encoding, Field, Frame, Sample, Tick, Topic, input, inputs, now_ns};
-pub use error::{Error, Result};
+pub use error::{Error, ErrorKind, Result};
 pub use inference::{DetectOptions, Detection, Model, Tensor};
 pub use lambda::Lambda;
 #[doc(hidden)]

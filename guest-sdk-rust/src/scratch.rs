@@ -8,6 +8,7 @@
 use crate::Result;
 use crate::bindings::gleaner::lambda::scratch as wit;
 pub use crate::bindings::gleaner::lambda::scratch::{Entry, ScratchError};
+pub use crate::error::ScratchErrorKind;
 use crate::error::into_result;
 
 /// Stores `bytes` under a name; replaces an existing entry.

@@ -7,6 +7,7 @@
 use crate::Result;
 use crate::bindings::gleaner::lambda::trigger as wit;
 pub use crate::bindings::gleaner::lambda::trigger::TriggerError;
+pub use crate::error::TriggerErrorKind;
 use crate::error::into_result;
 
 /// Builds an event, which [`EventBuilder::send`] reports. An event opens the `[record]` window
@@ -91,26 +92,10 @@ fn attribute(key: &str, value: impl Into<AttributeValue>) -> wit::Attribute {
 /// Value of an attribute; converted from `bool`, `i64`, `f64` and `&str`.
 pub struct AttributeValue(wit::AttributeValue);
 
-impl From<bool> for AttributeValue {
-    fn from(value: bool) -> Self {
-        Self(wit::AttributeValue::Boolean(value))
-    }
-}
-
-impl From<i64> for AttributeValue {
-    fn from(value: i64) -> Self {
-        Self(wit::AttributeValue::Signed(value))
-    }
-}
-
-impl From<f64> for AttributeValue {
-    fn from(value: f64) -> Self {
-        Self(wit::AttributeValue::Real(value))
-    }
-}
-
-impl From<&str> for AttributeValue {
-    fn from(value: &str) -> Self {
-        Self(wit::AttributeValue::Text(value.to_owned()))
-    }
+conversions! {
+    AttributeValue:
+    bool => |value| wit::AttributeValue::Boolean(value),
+    i64 => |value| wit::AttributeValue::Signed(value),
+    f64 => |value| wit::AttributeValue::Real(value),
+    &str => |value| wit::AttributeValue::Text(value.to_owned()),
 }

@@ -37,11 +37,8 @@ pub struct CheckArgs {
     lambda_args: LambdaArgs,
 }
 
-/// A lambda to check.
 pub struct CheckJob {
-    /// The lambda, with its settings.
     pub lambda: ConfiguredLambda,
-    /// Its manifest.
     pub manifest: Manifest,
 }
 

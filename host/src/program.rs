@@ -207,7 +207,6 @@ impl RuntimeCommand {
     }
 }
 
-/// `main` of `gleaner-runtime`.
 pub fn main() -> ExitCode {
     prepare();
     let cli = Cli::parse();

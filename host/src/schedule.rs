@@ -7,7 +7,6 @@ use gleaner_rules::schedule::{self as rules, Backlog};
 
 use crate::api::data::{Sample, Topic, Wake};
 
-/// The schedule of one lambda.
 pub struct WakeSchedule(rules::Schedule<EventInput>);
 
 /// The input whose samples wake the lambda.

@@ -13,39 +13,24 @@ use gleaner_lambda::{Fault, Trigger, TriggerKind};
 /// The reason why bytes cannot be decoded as a wake.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum MalformedWake {
-    /// The bytes end within a wake.
     #[error("a wake continues beyond the end of its block")]
     Short,
     /// A number is longer than 64 bits, or out of range.
     #[error("a number in a wake is too large")]
     Number,
-    /// A bit is reserved, or a kind is unknown.
     #[error("a wake has the unknown {what} {value}")]
-    Unknown {
-        /// The field.
-        what: &'static str,
-        /// Value of the field.
-        value: u8,
-    },
-    /// A text is not UTF-8.
+    Unknown { what: &'static str, value: u8 },
     #[error("a text in a wake is not UTF-8")]
     Text,
-    /// A score is infinite or not a number.
     #[error("the score of a trigger is not finite")]
     Score,
-    /// A wake has too many triggers.
     #[error("a wake has {found} triggers, above the maximum of {TRIGGERS_MAX}")]
-    Triggers {
-        /// The number of triggers.
-        found: u64,
-    },
-    /// The attributes of a trigger are too long.
+    Triggers { found: u64 },
     #[error("a trigger has {found} bytes of attributes, above the maximum of {ATTRIBUTES_MAX}")]
     LongAttributes {
         /// The length of the attributes as JSON, in bytes.
         found: u64,
     },
-    /// The attributes of a trigger are not a JSON object.
     #[error("the attributes of a trigger are not a JSON object")]
     Attributes,
 }
@@ -59,7 +44,6 @@ pub struct Decoder {
 }
 
 impl Decoder {
-    /// Creates a decoder for a lambda with `inputs` inputs.
     pub fn new(inputs: usize) -> Decoder {
         Decoder { previous: PreviousWake::none(inputs) }
     }

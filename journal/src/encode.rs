@@ -16,7 +16,6 @@ pub struct Encoder {
 }
 
 impl Encoder {
-    /// Creates an encoder for a lambda with `inputs` inputs.
     pub fn new(inputs: usize) -> Encoder {
         Encoder { previous: PreviousWake::none(inputs), json: Vec::new() }
     }

@@ -12,21 +12,16 @@ use gleaner_lambda::{Fault, Trigger};
 pub struct JournalEntry {
     /// Stamp of the sample or tick, in ns.
     pub at_ns: i64,
-    /// The cause of the wake.
     pub cause: WakeSource,
     /// The state of each input, in the order of the header.
     pub seen: Vec<InputView>,
-    /// The triggers of the lambda, in their order.
     pub triggers: Vec<Trigger>,
-    /// The fault that ended the wake early, if any.
     pub fault: Option<Fault>,
     /// Fuel that the wake burnt; `None` for Python, which has none.
     pub fuel: Option<u64>,
-    /// Digest of the log lines of the wake.
     pub log: LogDigest,
 }
 
-/// The cause of a wake.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum WakeSource {
     /// A sample of the input that its schedule names.
@@ -36,7 +31,6 @@ pub enum WakeSource {
         /// Sequence number of the sample, which its writer counts.
         seq: u64,
     },
-    /// The clock.
     Tick {
         /// Number of ticks without a wake since the previous wake.
         missed: u64,
@@ -64,10 +58,8 @@ pub struct InputView {
     pub reach: u64,
 }
 
-/// The digest of the log lines of one wake.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct LogDigest {
-    /// Number of lines.
     pub lines: u32,
     /// CRC-32 of the lines; 0 for none.
     pub digest: u32,

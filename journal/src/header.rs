@@ -19,15 +19,11 @@ pub struct JournalHeader {
     pub engine: String,
     /// The machine's architecture, for example `x86_64`.
     pub machine: String,
-    /// Name of the lambda.
     pub lambda: String,
-    /// Version of the lambda.
     pub version: String,
-    /// Kind of the lambda.
     pub kind: LambdaKind,
     /// The files of the lambda's build folder, by path.
     pub files: Vec<FileDigest>,
-    /// The models of the lambda.
     pub models: Vec<FileDigest>,
     /// SHA-256 of the parts of the manifest on which a decision can depend, in hexadecimal digits:
     /// without `[record]` and descriptions, so that a clip can be verified after its preroll was
@@ -47,7 +43,6 @@ pub struct JournalHeader {
     pub remaps: Vec<(String, String)>,
     /// The clock of all times, for example `log time of the drive`.
     pub clock: String,
-    /// The replayed part of the drive.
     #[serde(default, skip_serializing_if = "TimeRange::is_all")]
     pub part: TimeRange,
     /// Number of wakes before the first one here: 0, except for the part of a journal in a clip.
@@ -76,18 +71,15 @@ impl TimeRange {
     }
 }
 
-/// A file and its digest.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct FileDigest {
     /// Path relative to the build folder.
     pub path: String,
-    /// Length in bytes.
     pub bytes: u64,
     /// SHA-256 of the file, in hexadecimal digits.
     pub sha256: String,
 }
 
-/// An input of the lambda.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct JournalInput {
     /// Name of the input in the lambda's code.
@@ -96,18 +88,15 @@ pub struct JournalInput {
     pub topic: String,
     /// The topic after remapping.
     pub wire_topic: String,
-    /// The message type.
     pub type_name: String,
 }
 
 /// The last block of a complete journal, as JSON.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct JournalEnd {
-    /// Number of wakes.
     pub wakes: u64,
     /// Number of samples that arrived, for each input.
     pub samples: Vec<u64>,
-    /// The replayed drives.
     pub drives: Vec<DriveDigest>,
 }
 
@@ -117,7 +106,6 @@ pub struct JournalEnd {
 pub struct DriveDigest {
     /// Name of the file, without its folder.
     pub name: String,
-    /// Length in bytes.
     pub bytes: u64,
     /// CRC-32 of the whole file.
     pub crc32: u32,
@@ -128,9 +116,7 @@ pub struct DriveDigest {
 pub struct Difference {
     /// The compared item, for example ``build file `main.py` ``.
     pub what: String,
-    /// Value of the item in the journal.
     pub journal: String,
-    /// Value of the item now.
     pub now: String,
 }
 

@@ -74,15 +74,10 @@ pub(super) mod flag {
     pub(crate) const WRITER: u8 = 1 << 1;
     /// The waking sample does not have the expected number, or ticks were missed: a number follows.
     pub(crate) const NUMBER: u8 = 1 << 2;
-    /// The wake has fuel.
     pub(crate) const FUEL: u8 = 1 << 3;
-    /// The wake has triggers.
     pub(crate) const TRIGGERS: u8 = 1 << 4;
-    /// The wake ended in a fault.
     pub(crate) const FAULT: u8 = 1 << 5;
-    /// The wake wrote to its log.
     pub(crate) const LOG: u8 = 1 << 6;
-    /// Has no meaning yet.
     pub(crate) const RESERVED: u8 = 1 << 7;
 }
 
@@ -100,7 +95,6 @@ pub(super) mod seen {
 
 /// Forms of a newest sample that is not the expected one.
 pub(super) mod newest {
-    /// No sample.
     pub(crate) const NONE: u8 = 0;
     /// The same writer as before: its number relative to the expected one follows.
     pub(crate) const SAME_WRITER: u8 = 1;

@@ -98,7 +98,6 @@ impl<R: Read> JournalReader<R> {
         })
     }
 
-    /// Returns the header.
     pub fn header(&self) -> &JournalHeader {
         &self.header
     }
@@ -240,7 +239,6 @@ struct BlockSource<R> {
     bytes: R,
     /// Number of bytes read.
     offset: u64,
-    /// Number of blocks read.
     blocks: u64,
 }
 

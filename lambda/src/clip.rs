@@ -50,18 +50,13 @@ impl Clip {
     pub const MOMENTS_MAX: usize = 100;
 }
 
-/// A lambda with windows in a clip.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ClipLambda {
-    /// Name of the lambda.
     pub name: String,
-    /// Version of the lambda.
     pub version: String,
-    /// Kind of the lambda.
     pub kind: LambdaKind,
     /// SHA-256 of the digests of its files, in hexadecimal digits.
     pub digest: String,
-    /// Number of its windows in the clip.
     pub windows: u64,
 }
 
@@ -70,7 +65,6 @@ pub struct ClipLambda {
 pub struct Moment {
     /// The lambda that triggered, or whose `[record]` a command used.
     pub lambda: String,
-    /// The kind of trigger.
     pub kind: TriggerKind,
     /// The lambda's name for the event.
     pub label: String,
@@ -126,11 +120,9 @@ fn fits(attributes: &Map<String, Value>) -> bool {
 /// A topic of a clip. `None` means unknown, for example after the recorder died.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ClipTopic {
-    /// The topic.
     pub topic: String,
     /// Message type of the topic; `None` if it was requested and never appeared.
     pub type_name: Option<String>,
-    /// Number of its messages in the clip.
     pub messages: u64,
     /// Number of its messages that reached the recorder within the windows of the clip.
     pub received: Option<u64>,

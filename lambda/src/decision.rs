@@ -11,7 +11,6 @@ use serde::{Deserialize, Serialize};
 pub struct Decision {
     /// Log time of the sample or tick that woke the lambda, in ns since the epoch of the drive.
     pub at_ns: i64,
-    /// The cause of the wake.
     pub cause: Cause,
     /// Name of the input that woke it; `None` for a tick.
     pub input: Option<String>,
@@ -22,7 +21,6 @@ pub struct Decision {
     pub writer: Option<String>,
     /// Sequence number of the waking sample among those of its writer.
     pub seq: Option<u64>,
-    /// The triggers of the lambda, in their order.
     pub triggers: Vec<Trigger>,
     /// The fault that ended the wake early, if any. Triggers before it still count.
     pub fault: Option<Fault>,
@@ -40,7 +38,6 @@ fn is_zero(count: &u64) -> bool {
     *count == 0
 }
 
-/// The cause of a wake.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Cause {
@@ -54,7 +51,6 @@ pub enum Cause {
 /// An action that a lambda took.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Trigger {
-    /// The action of the recorder.
     pub kind: TriggerKind,
     /// The lambda's name for the event, for example `hard-brake`.
     pub label: String,
@@ -90,9 +86,7 @@ impl TriggerKind {
 /// The reason why a wake ended early.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Fault {
-    /// The kind of fault.
     pub kind: FaultKind,
-    /// A description for the user.
     pub message: String,
     /// The amount used, in the unit of the limit: fuel units, ns for a deadline, bytes for memory.
     pub used: Option<u64>,
@@ -100,17 +94,12 @@ pub struct Fault {
     pub allowed: Option<u64>,
 }
 
-/// The kinds of fault.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum FaultKind {
-    /// The fuel of the wake was burnt.
     Fuel,
-    /// The wake outlasted its deadline.
     Deadline,
-    /// The lambda requested more memory than allowed.
     Memory,
-    /// The call stack overflowed.
     Stack,
     /// WebAssembly trapped: a panic, a division by zero, an access out of bounds.
     Trap,

@@ -24,7 +24,6 @@ pub const BUILD_MAX: ByteSize = ByteSize::gib(4);
 /// the header of a journal.
 pub const FILES_MAX: usize = 4_000;
 
-/// Longest component that is compiled.
 pub const COMPONENT_MAX: ByteSize = ByteSize::mib(64);
 
 /// `DIR/build/` of one lambda.
@@ -125,12 +124,10 @@ impl BuildDir {
         Ok(files)
     }
 
-    /// Returns the path of the folder.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Returns the path of its `lambda.toml`.
     pub fn manifest_path(&self) -> PathBuf {
         self.path.join("lambda.toml")
     }
@@ -144,73 +141,34 @@ impl BuildDir {
 /// The reason why a build folder cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum LayoutError {
-    /// The lambda's folder does not exist.
     #[error("there is no folder `{}`", dir.display())]
-    NoFolder {
-        /// The folder.
-        dir: PathBuf,
-    },
-    /// The lambda's folder is a file.
+    NoFolder { dir: PathBuf },
     #[error("`{}` is not a folder", path.display())]
-    File {
-        /// The file.
-        path: PathBuf,
-    },
-    /// The given folder is a build, not a lambda's folder.
+    File { path: PathBuf },
     #[error("`{}` is the build folder of a lambda", build.display())]
-    IsBuild {
-        /// The build folder.
-        build: PathBuf,
-        /// The lambda's folder.
-        dir: PathBuf,
-    },
-    /// The folder has no manifest.
+    IsBuild { build: PathBuf, dir: PathBuf },
     #[error("folder `{}` has no lambda.toml", dir.display())]
-    NoManifest {
-        /// The folder.
-        dir: PathBuf,
-    },
-    /// The lambda has no build folder.
+    NoManifest { dir: PathBuf },
     #[error("lambda `{}` is not built", dir.display())]
-    Missing {
-        /// The lambda's folder.
-        dir: PathBuf,
-    },
-    /// A source is newer than the build.
+    Missing { dir: PathBuf },
     #[error(
         "the build of lambda `{}` is older than its source `{}`",
         dir.display(),
         source_file.display()
     )]
     Older {
-        /// The lambda's folder.
         dir: PathBuf,
         /// The manifest, or else the newest source, relative to it.
         source_file: PathBuf,
     },
-    /// The manifest of the build is refused.
     #[error(transparent)]
     Manifest(#[from] ManifestError),
-    /// Too many files for a build.
     #[error("`{}` holds more than {FILES_MAX} files", build.display())]
-    TooMany {
-        /// The build folder.
-        build: PathBuf,
-    },
-    /// Too many bytes for a build.
+    TooMany { build: PathBuf },
     #[error("the files in `{}` have more than {BUILD_MAX}", build.display())]
-    TooLarge {
-        /// The build folder.
-        build: PathBuf,
-    },
-    /// A file or folder of the lambda cannot be read.
+    TooLarge { build: PathBuf },
     #[error("cannot read `{}`", path.display())]
-    Read {
-        /// The file or folder.
-        path: PathBuf,
-        /// The cause.
-        source: io::Error,
-    },
+    Read { path: PathBuf, source: io::Error },
 }
 
 const FOLDER_FIRST: &str = "name the lambda's folder, which has a lambda.toml; \

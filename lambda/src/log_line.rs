@@ -2,10 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-/// The severity of a log line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-#[allow(missing_docs)]
 pub enum LogLevel {
     Error,
     Warn,
@@ -19,7 +17,6 @@ pub enum LogLevel {
 pub struct LogLine {
     /// Time of the wake that logged it, in ns.
     pub at_ns: i64,
-    /// Severity of the line.
     pub level: LogLevel,
     /// The text, cut by the host to a maximum length.
     pub message: String,

@@ -31,13 +31,10 @@ const PREVIOUS_LOG: &str = "log.before.jsonl";
 pub const RESULTS: [&str; 8] =
     [LOCK, "clips.jsonl", "decisions.jsonl", "log.jsonl", PREVIOUS_LOG, REPORT, SIGNALS, SUMMARY];
 
-/// A result file could not be written.
 #[derive(Debug, thiserror::Error)]
 #[error("cannot write `{}`", path.display())]
 pub struct OutputError {
-    /// The file.
     pub path: PathBuf,
-    /// The cause.
     pub source: io::Error,
 }
 

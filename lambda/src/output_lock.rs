@@ -15,23 +15,12 @@ pub struct OutputLock {
     _lock: File,
 }
 
-/// A folder that cannot be locked.
 #[derive(Debug, thiserror::Error)]
 pub enum OutputLockError {
-    /// Another process holds the lock.
     #[error("another replay writes into `{}`", folder.display())]
-    Busy {
-        /// The folder.
-        folder: PathBuf,
-    },
-    /// The folder or its lock file cannot be used.
+    Busy { folder: PathBuf },
     #[error("cannot lock `{}`", path.display())]
-    Lock {
-        /// The lock file.
-        path: PathBuf,
-        /// The cause.
-        source: io::Error,
-    },
+    Lock { path: PathBuf, source: io::Error },
 }
 
 impl OutputLock {

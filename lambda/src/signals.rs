@@ -31,18 +31,14 @@ pub struct Signals {
 }
 
 impl Signals {
-    /// Maximum number of curves of one lambda.
     pub const CURVES_MAX: usize = 32;
-    /// Maximum number of points of one curve.
     pub const POINTS_MAX: usize = 4096;
-    /// Maximum number of pictures.
     pub const PICTURES_MAX: usize = 64;
 }
 
 /// One number over time, as a lambda read it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Curve {
-    /// Name of the input.
     pub input: String,
     /// Topic of the input, after remapping.
     pub topic: String,
@@ -54,13 +50,10 @@ pub struct Curve {
     pub samples: u64,
     /// Number of samples in which it was NaN or infinite: these are in no point.
     pub non_finite: u64,
-    /// Number of samples in one point.
     pub per_point: u64,
     /// Stamp of the first sample of each point, in ns since the epoch of the drive.
     pub at_ns: Vec<i64>,
-    /// Minimum of each point.
     pub min: Vec<f64>,
-    /// Maximum of each point.
     pub max: Vec<f64>,
 }
 
@@ -69,21 +62,15 @@ pub struct Curve {
 pub struct Distribution {
     /// Number of wakes with a value.
     pub count: u64,
-    /// Minimum.
     pub min: u64,
-    /// Median.
     pub p50: u64,
-    /// 90th percentile.
     pub p90: u64,
-    /// 99th percentile.
     pub p99: u64,
-    /// Maximum.
     pub max: u64,
     /// Histogram, with bins that grow with the value; empty bins are left out.
     pub bins: Vec<Bin>,
 }
 
-/// A bin of a histogram.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Bin {
     /// Lower end, inclusive.
@@ -99,7 +86,6 @@ pub struct Bin {
 pub struct TriggerPicture {
     /// Time of the wake that triggered, in ns since the epoch of the drive.
     pub at_ns: i64,
-    /// Topic of the camera.
     pub topic: String,
     /// Stamp of the image, the newest that had arrived.
     pub image_ns: i64,

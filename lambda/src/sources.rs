@@ -104,7 +104,6 @@ impl Sources {
         Ok(found)
     }
 
-    /// Returns all sources.
     pub fn iter(&self) -> impl Iterator<Item = &Path> {
         self.copied.iter().chain(&self.compiled).map(PathBuf::as_path)
     }

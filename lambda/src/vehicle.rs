@@ -16,18 +16,13 @@ use crate::manifest::{self, ItemName, Limits, ManifestError, TopicName, bounds};
 pub struct Vehicle {
     /// `[vehicle]`.
     pub identity: VehicleIdentity,
-    /// `[network]`.
     pub network: NetworkSettings,
     /// `[limits]`: upper bounds of the limits of each lambda. Limits that the file does not name
     /// are at the maximum of manifests.
     pub limits: Limits,
-    /// `[inference]`.
     pub inference: InferenceLimits,
-    /// `[recording]`.
     pub recording: RecordingSettings,
-    /// `[deployments]`.
     pub deployments: DeploymentSettings,
-    /// `[metrics]`.
     pub metrics: MetricsSettings,
 }
 
@@ -54,11 +49,9 @@ pub struct NetworkSettings {
 /// `[recording]`: settings of the recorder of the daemon.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct RecordingSettings {
-    /// Topic of recording commands.
     pub commands: Option<TopicName>,
     /// Free space of the disk below which no clip is started.
     pub disk_floor: Option<ByteSize>,
-    /// Maximum number of clips to keep.
     pub clips_max: Option<u64>,
     /// Maximum total size of clips to keep.
     pub bytes_max: Option<ByteSize>,
@@ -94,11 +87,9 @@ pub struct MetricsSettings {
 /// `[inference]`: limits of the process that runs models.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct InferenceLimits {
-    /// Memory that it may take.
     pub memory: ByteSize,
     /// Longest run of a model that cannot be interrupted.
     pub run_max: Duration,
-    /// Longest time to load a model.
     pub load_max: Duration,
 }
 

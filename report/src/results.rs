@@ -12,31 +12,19 @@ use gleaner_lambda::results::{LINE_MAX, LINES_MAX};
 use gleaner_lambda::{Clip, Decision};
 use serde::de::DeserializeOwned;
 
-/// Errors of [`JsonLines`].
 #[derive(Debug, thiserror::Error)]
 pub enum ResultsError {
-    /// A file cannot be read.
     #[error("cannot read `{}`", path.display())]
-    Read {
-        /// The file.
-        path: PathBuf,
-        /// The cause.
-        source: io::Error,
-    },
-    /// A line is not a decision, clip or log line.
+    Read { path: PathBuf, source: io::Error },
     #[error("`{}`, line {line}, is not a line that gleaner writes", path.display())]
     Line {
-        /// The file.
         path: PathBuf,
         /// The line, from 1.
         line: usize,
-        /// The cause.
         source: serde_json::Error,
     },
-    /// A line is longer than Gleaner writes any.
     #[error("`{}`, line {line}, is longer than {LINE_MAX}", path.display())]
     Long {
-        /// The file.
         path: PathBuf,
         /// The line, from 1.
         line: usize,

@@ -19,58 +19,32 @@ use crate::results::ResultsError;
 /// Maximum number of topics in a summary. A lambda has fewer, but the file is untrusted.
 const TOPICS_MAX: usize = 256;
 const DRIVES_MAX: usize = 50;
-/// Maximum number of characters of a name.
 const NAME_CHARS: usize = 300;
-/// Maximum number of config values.
 const CONFIG_MAX: usize = 200;
 /// Maximum number of characters of a reason or an error.
 const WHY_CHARS: usize = 2_000;
 
-/// Errors of reading a result folder.
 #[derive(Debug, thiserror::Error)]
 pub enum OutputError {
-    /// The folder has no `summary.json`.
     #[error("`{}` does not hold results", out.display())]
     None {
-        /// The folder.
         out: PathBuf,
         /// Subfolders that hold results.
         inside: Vec<PathBuf>,
-        /// The cause.
         source: FileError,
     },
-    /// The `summary.json` or `signals.json` of the folder is not valid.
     #[error("`{}` is not a result file of this gleaner", path.display())]
-    Invalid {
-        /// The file.
-        path: PathBuf,
-        /// The cause.
-        source: FileError,
-    },
-    /// A JSON lines file that no run of Gleaner has written.
+    Invalid { path: PathBuf, source: FileError },
     #[error(transparent)]
     Lines(#[from] ResultsError),
 }
 
-/// Errors of reading `summary.json` or `signals.json`.
 #[derive(Debug, thiserror::Error)]
 pub enum FileError {
-    /// The file cannot be opened or read.
     #[error("cannot read `{name}`")]
-    Read {
-        /// Name of the file in the folder.
-        name: &'static str,
-        /// The cause.
-        source: io::Error,
-    },
-    /// The file is not JSON, or lacks keys.
+    Read { name: &'static str, source: io::Error },
     #[error("cannot parse `{name}`")]
-    Json {
-        /// Name of the file in the folder.
-        name: &'static str,
-        /// The cause.
-        source: serde_json::Error,
-    },
+    Json { name: &'static str, source: serde_json::Error },
 }
 
 impl FileError {
@@ -113,7 +87,6 @@ pub(crate) enum RunSummary {
     Live(Box<LiveStatus>),
 }
 
-/// Numbers of samples of an input, received and lost.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
 pub(crate) struct TopicCounts {
     pub(crate) input: String,

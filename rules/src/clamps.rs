@@ -5,11 +5,8 @@ use std::ops::Range;
 
 use crate::text::cut;
 
-/// Maximum number of samples that one call returns.
 pub const SAMPLES_PER_CALL: usize = 256;
-/// Longest list of strings in one field.
 pub const TEXTS_PER_FIELD: usize = 4096;
-/// Longest path of a field, in bytes.
 pub const PATH_BYTES: usize = 1024;
 
 /// The limits `call_bytes` and `call_items` of one call, from `[limits]`.
@@ -28,11 +25,8 @@ pub enum Length {
     One,
     /// Text, in bytes.
     Text(usize),
-    /// Bytes.
     Bytes(usize),
-    /// Numbers.
     Numbers(usize),
-    /// Texts.
     Texts(usize),
 }
 

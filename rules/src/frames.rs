@@ -23,17 +23,13 @@ pub struct FrameLease {
     bytes: usize,
 }
 
-/// The reason why another frame is refused.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum NoRoom {
-    /// The lambda holds the maximum number of frames.
     Frames {
-        /// The maximum.
         allowed: usize,
     },
     /// The frames that the lambda created use too much memory.
     Bytes {
-        /// Bytes of the new frame.
         needed: usize,
         /// Remaining bytes of `memory` in `[limits]`.
         left: usize,
@@ -59,7 +55,6 @@ impl fmt::Display for NoRoom {
 impl std::error::Error for NoRoom {}
 
 impl Budget {
-    /// Creates a budget of `frames` frames and `bytes` bytes.
     pub fn new(frames: usize, bytes: usize) -> Self {
         let (left, bytes) = (AtomicUsize::new(frames), AtomicUsize::new(bytes));
         Self(Arc::new(Remaining { frames: left, frames_allowed: frames, bytes }))

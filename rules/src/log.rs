@@ -20,7 +20,6 @@ pub struct Rate {
 }
 
 impl Rate {
-    /// Creates a counter with these limits.
     pub fn new(lines_per_second: u64, bytes_per_second: u64) -> Self {
         let (window, notes) = Default::default();
         Self { lines_per_second, bytes_per_second, window, notes, dropped: 0 }
@@ -57,7 +56,6 @@ impl Rate {
         is_new
     }
 
-    /// Returns the number of dropped lines since the start.
     pub fn dropped(&self) -> u64 {
         self.dropped
     }

@@ -3,9 +3,7 @@
 /// Longest topic name that rmw accepts, in bytes.
 const TOPIC_NAME_MAX: usize = 247;
 
-/// The type of raw images.
 pub const IMAGE: &str = "sensor_msgs/msg/Image";
-/// The type of compressed images.
 pub const COMPRESSED_IMAGE: &str = "sensor_msgs/msg/CompressedImage";
 
 /// Returns whether `text` has 1 to 63 characters: first a lower-case letter, then those, digits and
@@ -53,7 +51,6 @@ pub fn is_type(text: &str) -> bool {
         && name.bytes().all(|byte| byte.is_ascii_alphanumeric())
 }
 
-/// Returns whether samples of this type are frames.
 pub fn is_frame(type_name: &str) -> bool {
     type_name == IMAGE || type_name == COMPRESSED_IMAGE
 }

@@ -3,7 +3,6 @@
 
 use std::fmt;
 
-/// One step of a path.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PathSegment<'p> {
     /// A field of a message.
@@ -12,10 +11,8 @@ pub enum PathSegment<'p> {
     Index(usize),
 }
 
-/// A text that is not a valid path.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct MalformedPath {
-    /// The text.
     pub path: String,
     /// The invalid rest of it.
     pub rest: String,

@@ -5,13 +5,11 @@ use std::fmt::Display;
 
 use crate::text::{RoundedBytes, quoted};
 
-/// Returns the text for an unknown input.
 pub fn no_such_input<S: AsRef<str>>(name: &str, known: impl IntoIterator<Item = S>) -> String {
     let name = name.chars().take(64).collect::<String>();
     format!("no input `{name}`; the manifest has {}", quoted(known))
 }
 
-/// Returns the text for an unknown model.
 pub fn no_such_model<S: AsRef<str>>(name: &str, known: impl IntoIterator<Item = S>) -> String {
     let (name, known) = (name.chars().take(64).collect::<String>(), quoted(known));
     let way_out = if known == "none" { "; add a [[model]] of this name" } else { "" };
@@ -23,7 +21,6 @@ pub fn malformed(topic: &str, type_name: &str, why: impl Display) -> String {
     format!("a sample of `{topic}` contradicts its type `{type_name}`: {why}")
 }
 
-/// Returns the text for a message whose type is not an image.
 pub fn no_image_type(topic: &str, type_name: &str) -> String {
     format!("a sample of `{topic}` is not an image: its type is `{type_name}`")
 }

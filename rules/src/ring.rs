@@ -10,7 +10,6 @@ use std::sync::Arc;
 /// A cell with a sample. The lambda holds it while there is a second `Arc` of it.
 #[derive(Debug)]
 pub struct Cell<T> {
-    /// The sample.
     pub sample: T,
     /// Number of samples that entered before it.
     pub position: u64,
@@ -47,7 +46,6 @@ fn is_held<T>(cell: &Arc<Cell<T>>) -> bool {
 }
 
 impl<T> Ring<T> {
-    /// Creates an empty ring.
     pub fn new(depth: usize, hold: usize, max_size: usize) -> Self {
         let (counts, shown, hidden) = Default::default();
         Self { depth, cells: depth + hold + 1, max_size, counts, shown, hidden }
@@ -90,7 +88,6 @@ impl<T> Ring<T> {
         self.depth
     }
 
-    /// Returns the counts.
     pub fn counts(&self) -> Counts {
         self.counts
     }
@@ -100,7 +97,6 @@ impl<T> Ring<T> {
         self.shown.iter().find(|cell| cell.position == position).cloned()
     }
 
-    /// Returns the newest shown sample.
     pub fn newest(&self) -> Option<Arc<Cell<T>>> {
         self.shown.back().cloned()
     }

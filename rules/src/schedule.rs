@@ -10,7 +10,6 @@ const CATCH_UP_TICKS: u64 = 100_000;
 
 /// A ring of one input, as a schedule reads it.
 pub trait RingView {
-    /// One sample in the ring.
     type Sample;
 
     /// Returns the number of samples that entered so far, which is the position of the next one.
@@ -43,12 +42,10 @@ pub struct Tick {
     pub missed: u64,
 }
 
-/// The schedule of one lambda.
 #[derive(Debug)]
 pub enum Schedule<R> {
     /// One wake for each sample, or for the newest one.
     Event(EventSchedule<R>),
-    /// One wake for each period.
     Periodic(PeriodicSchedule),
 }
 
@@ -73,7 +70,6 @@ pub struct PeriodicSchedule {
 }
 
 impl<R: RingView> Schedule<R> {
-    /// Wakes on samples of `ring`.
     pub fn event(ring: R, backlog: Backlog) -> Self {
         Self::Event(EventSchedule { ring, backlog, next: 0 })
     }
@@ -134,7 +130,6 @@ impl<R: RingView> Schedule<R> {
         }
     }
 
-    /// Returns the number of missed ticks.
     pub fn missed(&self) -> u64 {
         match self {
             Self::Event(_) => 0,

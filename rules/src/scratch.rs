@@ -12,23 +12,17 @@ const ENTRY_BYTES: u64 = 64;
 /// Length of the pieces in which bytes are kept, so that no call moves more than that.
 const PIECE_BYTES: usize = 1 << 20;
 
-/// The reason why a call was refused.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum ScratchError {
-    /// The entry exceeds the free bytes.
+    /// The entry needs this many additional bytes, and this many are free.
     NoRoom {
-        /// Name of the entry.
         name: String,
-        /// Additional bytes that it needs.
         needed: u64,
-        /// Free bytes.
         free: u64,
     },
-    /// The maximum number of entries is reached.
+    /// With this entry, there would be too many.
     TooMany(String),
-    /// No entry has that name.
     NoSuchEntry(String),
-    /// The name is invalid.
     WrongName(String),
 }
 
@@ -59,10 +53,8 @@ impl fmt::Display for ScratchError {
 
 impl std::error::Error for ScratchError {}
 
-/// Name and length of one entry.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Entry {
-    /// Name of the entry.
     pub name: String,
     /// Length of the value in bytes.
     pub bytes: u64,

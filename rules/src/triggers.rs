@@ -4,15 +4,11 @@ use std::fmt;
 
 use crate::text::cut;
 
-/// Maximum number of triggers of one wake.
 pub const PER_WAKE: usize = 16;
 /// Maximum number of attributes of one trigger.
 pub const ATTRIBUTES: usize = 16;
-/// Longest label, in bytes.
 pub const LABEL_BYTES: usize = 128;
-/// Longest key of an attribute, in bytes.
 pub const KEY_BYTES: usize = 64;
-/// Longest text of an attribute, in bytes.
 pub const TEXT_BYTES: usize = 1024;
 
 const MINUTE_NS: i64 = 60_000_000_000;
@@ -28,18 +24,14 @@ pub enum TriggerKind {
     Stop,
 }
 
-/// A named value of a trigger.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Attribute {
     /// Key of 1 to [`KEY_BYTES`] bytes, unique in its trigger.
     pub key: String,
-    /// Value of the attribute.
     pub value: AttributeValue,
 }
 
-/// Value of an [`Attribute`].
 #[derive(Clone, Debug, PartialEq)]
-#[allow(missing_docs)]
 pub enum AttributeValue {
     Boolean(bool),
     Signed(i64),
@@ -51,7 +43,6 @@ pub enum AttributeValue {
 
 /// The reason for a refused call, which had no effect.
 #[derive(Clone, Debug, PartialEq)]
-#[allow(missing_docs)]
 pub enum TriggerError {
     NoLabel,
     LongLabel { bytes: usize },
@@ -205,7 +196,6 @@ impl<T> Triggers<T> {
     }
 }
 
-/// Refuses an invalid label, score or attribute.
 fn check(label: &str, score: Option<f64>, attributes: &[Attribute]) -> Result<(), TriggerError> {
     match label.len() {
         0 => return Err(TriggerError::NoLabel),

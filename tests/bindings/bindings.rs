@@ -2,6 +2,8 @@
 //! generates from `wit/`. They are a file of the SDK so that a lambda compiles no generator.
 //! `cargo xtask bless` writes them: it sets `GLEANER_BLESS`.
 
+mod calls;
+
 use std::env;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -24,6 +26,15 @@ const LINTS: &str =
 
 fn path(relative: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").join(relative)
+}
+
+/// Compares a file of the checkout with its text, or writes it.
+fn is_up_to_date(file: &str, text: &str) {
+    if env::var_os("GLEANER_BLESS").is_some() {
+        return fs::write(path(file), text).expect("the file can be written");
+    }
+    let now = fs::read_to_string(path(file)).expect(file);
+    assert!(text == now, "run `cargo xtask bless`, which writes {file}");
 }
 
 fn generated() -> String {
@@ -51,9 +62,12 @@ fn generated() -> String {
 fn bindings_of_the_rust_sdk_are_up_to_date() {
     let text = generated();
     assert!(text == generated(), "the same `wit/` has the same bindings");
-    if env::var_os("GLEANER_BLESS").is_some() {
-        return fs::write(path(FILE), text).expect("the file can be written");
-    }
-    let now = fs::read_to_string(path(FILE)).expect(FILE);
-    assert!(text == now, "run `cargo xtask bless`, which writes {FILE}");
+    is_up_to_date(FILE, &text);
+}
+
+#[test]
+fn the_page_of_all_calls_is_up_to_date() {
+    let mut resolve = Resolve::default();
+    resolve.push_path(path("wit")).expect("`wit/` is a package");
+    is_up_to_date(calls::PAGE, &calls::page(&resolve));
 }

@@ -6,23 +6,24 @@
 /// Lines of Rust and Python of each folder at the top, without generated files: of sources, and of
 /// tests.
 pub const LINES: &[(&str, usize, usize)] = &[
-    ("base", 1248, 669),
+    ("base", 1223, 669),
     ("bench", 11757, 745),
-    ("cli", 11199, 4452),
-    ("cloud", 19413, 6587),
+    ("cli", 11169, 4450),
+    ("cloud", 18988, 6656),
     ("examples", 1318, 757),
+    ("fleet-client-python", 513, 319),
     ("fuzz", 4135, 83),
-    ("guest-sdk-python", 5883, 4113),
-    ("guest-sdk-rust", 5394, 1621),
-    ("host", 62842, 30395),
-    ("journal", 1854, 1251),
-    ("lambda", 4669, 2169),
-    ("orchestrator", 26099, 8618),
+    ("guest-sdk-python", 5363, 3718),
+    ("guest-sdk-rust", 5335, 1619),
+    ("host", 61799, 30390),
+    ("journal", 1771, 1251),
+    ("lambda", 4434, 2169),
+    ("orchestrator", 25971, 8629),
     ("player", 2214, 793),
-    ("report", 2764, 908),
-    ("rules", 2700, 1179),
-    ("tests", 6580, 12452),
-    ("xtask", 6893, 765),
+    ("report", 2688, 908),
+    ("rules", 2620, 1179),
+    ("tests", 6721, 12672),
+    ("xtask", 6101, 679),
 ];
 
 /// Files with functions of more than 80 lines, each with its reason.

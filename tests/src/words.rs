@@ -240,7 +240,6 @@ pub const SHARED_TYPES: &[&str] = &[
     "Args",
     "CallResult",
     "Column",
-    "ConfigValue",
     "Field",
     "Frame",
     "Model",

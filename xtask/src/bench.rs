@@ -19,9 +19,13 @@ pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, F
     match (name, arguments) {
         ("fleet", [_, rest @ ..]) => fleet(checkout, rest),
         ("parts", [_, rest @ ..]) => parts(checkout, rest),
-        ("compare", [_, base, head, name, rest @ ..]) => {
-            let [base_runs, head_runs] = revisions::measure(checkout, [base, head], name, rest)?;
-            compare(checkout, &["compare".into(), base_runs.into(), head_runs.into()])
+        ("compare", [_, rest @ ..]) if rest.len() > 2 => {
+            let measured = steps::run_script(&mut revisions::script(checkout, rest))?;
+            if measured != Exit::Ok {
+                return Ok(measured);
+            }
+            let [base, head] = revisions::runs(checkout).map(OsString::from);
+            compare(checkout, &["compare".into(), base, head])
         }
         ("compare", _) => compare(checkout, arguments),
         _ => measure(checkout, name, arguments),

@@ -13,8 +13,8 @@ use crate::examples::{DRIVE, EXAMPLES, Recipe, TwinReplay, difference};
 use crate::setup;
 use crate::steps::{self, Steps, cannot};
 
-/// Writes the files that are generated from the manifest's types, and the bindings of the Rust SDK,
-/// then `examples/*/expected.txt` with a line per trigger of the Rust twin, and
+/// Writes the files that are generated from the manifest's types, `docs/api`, and the bindings of
+/// the Rust SDK, then `examples/*/expected.txt` with a line per trigger of the Rust twin, and
 /// `examples/cookbook/*/expected.txt`, whose first line is the command. Fails if the twins of an
 /// example differ.
 pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
@@ -25,7 +25,12 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
         let text = file.text(&now).map_err(|why| Failure::new(Exit::Usage, why))?;
         write(checkout, Path::new(file.path), text)?;
     }
-    let mut steps = Steps::of(setup::STEPS + 2);
+    let mut steps = Steps::of(setup::STEPS + 3);
+    steps.begin("descriptions of the APIs");
+    let mut write_descriptions = checkout.cargo();
+    write_descriptions.args(["test", "--release", "--lib", "committed_description"]);
+    write_descriptions.args(["--package", "gleaner-cloud", "--package", "gleaner-orchestrator"]);
+    steps::run(write_descriptions.env("GLEANER_BLESS", "1"), "see the first error above")?;
     steps.begin("bindings of the Rust SDK");
     let mut write_bindings = setup::test_bindings(checkout);
     steps::run(write_bindings.env("GLEANER_BLESS", "1"), "see the first error above")?;

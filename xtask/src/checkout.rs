@@ -66,11 +66,6 @@ impl Checkout {
         String::from_utf8(output.stdout).unwrap().trim().to_owned()
     }
 
-    /// Another checkout, in `root`, with a target folder of its own.
-    pub(crate) fn other(&self, root: PathBuf) -> Checkout {
-        Checkout { target: root.join("target"), root, ..self.clone() }
-    }
-
     /// The same checkout, whose cargo builds programs that print `commit` with their versions.
     pub(crate) fn with_commit(&self, commit: Option<String>) -> Checkout {
         Checkout { commit, ..self.clone() }
@@ -123,9 +118,9 @@ impl Checkout {
         cargo
     }
 
-    /// A command that runs a script of the checkout as a user would start it.
-    pub(crate) fn script(&self, script: &str) -> Command {
-        let mut command = Command::new(self.path(script));
+    /// A command that runs a script in the checkout as a user would start it.
+    pub(crate) fn script(&self, script: impl AsRef<OsStr>) -> Command {
+        let mut command = Command::new(script);
         remove_package(&mut command);
         command.current_dir(&self.root);
         command

@@ -4,7 +4,7 @@
 //! of the checkout are copied to a folder, beside `SUMMARY.md` of `docs` with adapted links.
 
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use gleaner_base::{Exit, Failure};
 
@@ -14,12 +14,9 @@ use crate::steps::{self, Steps};
 /// The version that the book was checked with.
 const MDBOOK: &str = "0.5.4";
 
-/// Names and extensions of files that pages link to.
+/// Files that pages link to, as patterns of git.
 const LINKED: [&str; 10] =
-    ["md", "png", "rs", "py", "toml", "txt", "wit", "ipynb", "LICENSE", "json"];
-
-/// Folders without pages, and those that tools make.
-const SKIPPED: [&str; 5] = ["target", "out", "build", "fuzz", "__pycache__"];
+    ["*.md", "*.png", "*.rs", "*.py", "*.toml", "*.txt", "*.wit", "*.ipynb", "*LICENSE", "*.json"];
 
 /// Fetches mdBook if it is not there, and builds the book.
 pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
@@ -36,7 +33,12 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     }
     steps.begin("the book");
     let source = checkout.target().join("book-source");
-    copy_pages(checkout, &source).map_err(|error| {
+    let mut list = checkout.command("git");
+    let files = steps::output(
+        list.args(["ls-files", "--cached", "--others", "--exclude-standard", "--"]).args(LINKED),
+        "run it in a checkout",
+    )?;
+    copy_pages(checkout, &files, &source).map_err(|error| {
         Failure::caused_by(Exit::Internal, "cannot copy the pages of the book", &error)
     })?;
     let mut build = checkout.command(&mdbook);
@@ -51,37 +53,24 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
 }
 
 /// Copies the pages and linked files to `to`, for mdBook.
-fn copy_pages(checkout: &Checkout, to: &Path) -> std::io::Result<()> {
+fn copy_pages(checkout: &Checkout, files: &str, to: &Path) -> std::io::Result<()> {
     if to.exists() {
         fs::remove_dir_all(to)?;
     }
-    let mut folders = vec![PathBuf::new()];
-    while let Some(folder) = folders.pop() {
-        for entry in fs::read_dir(checkout.path(&folder))? {
-            let entry = entry?;
-            let name = entry.file_name().to_string_lossy().into_owned();
-            let path = folder.join(&name);
-            let kind = entry.file_type()?;
-            if kind.is_dir() {
-                if !name.starts_with('.') && !SKIPPED.contains(&&*name) {
-                    folders.push(path);
-                }
-            } else if kind.is_file()
-                && LINKED.contains(&name.rsplit('.').next().unwrap_or_default())
-            {
-                let copy = to.join("src").join(path);
-                fs::create_dir_all(copy.parent().unwrap_or(to))?;
-                if name.ends_with(".md") {
-                    // mdBook renames the page of a README to `index.html`, but not links to it.
-                    let page = fs::read_to_string(entry.path())?;
-                    fs::write(
-                        copy,
-                        page.replace("README.md)", "index.md)").replace("README.md#", "index.md#"),
-                    )?;
-                } else {
-                    fs::copy(entry.path(), copy)?;
-                }
-            }
+    for path in files.lines() {
+        let (file, copy) = (checkout.path(path), to.join("src").join(path));
+        // One that was removed is listed until that is committed.
+        if !file.exists() {
+            continue;
+        }
+        fs::create_dir_all(copy.parent().unwrap_or(to))?;
+        if path.ends_with(".md") {
+            // mdBook renames the page of a README to `index.html`, but not links to it.
+            let page = fs::read_to_string(file)?;
+            let page = page.replace("README.md)", "index.md)").replace("README.md#", "index.md#");
+            fs::write(copy, page)?;
+        } else {
+            fs::copy(file, copy)?;
         }
     }
     let summary = fs::read_to_string(checkout.path("docs/SUMMARY.md"))?;

@@ -17,7 +17,7 @@ pub(crate) struct GlibcVersion(u32, u32);
 /// The version of Ubuntu 22.04, and with it of JetPack 6.
 pub(crate) const OF_JETPACK: GlibcVersion = GlibcVersion(2, 35);
 
-/// The versions that a file needs, with the symbols of each.
+/// The symbols that a file needs, by their versions.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(crate) struct GlibcNeeds {
     symbols: BTreeMap<GlibcVersion, Vec<String>>,
@@ -35,25 +35,21 @@ impl GlibcNeeds {
         Ok(Self::parse(&steps::output(&mut readelf, help)?))
     }
 
-    /// Parses the output of `readelf`. A needed version is a line with `Name: GLIBC_2.34`, and a
-    /// symbol that a program needs one that ends in `UND NAME@GLIBC_2.34 (5)`.
+    /// Parses the output of `readelf`. A symbol that a program needs is a line that ends in
+    /// `UND NAME@GLIBC_2.34 (5)`, and a needed version or format one with `Name: GLIBC_2.34`.
     fn parse(text: &str) -> Self {
         let mut needs = Self::default();
         for line in text.lines() {
-            if let Some(name) = line.split_once("Name: GLIBC_").map(|(_, rest)| rest) {
-                let name = name.split_whitespace().next().unwrap_or_default();
-                match GlibcVersion::parse(name) {
-                    Some(version) => drop(needs.symbols.entry(version).or_default()),
-                    None => needs.formats.push(format!("GLIBC_{name}")),
-                }
-            }
-            let symbol = line.split_once(" UND ").and_then(|(_, rest)| rest.split_once("@GLIBC_"));
-            if let Some((symbol, version)) = symbol
-                && let Some(version) = version.split([' ', '@']).next()
-                && let Some(version) = GlibcVersion::parse(version)
-            {
-                needs.symbols.entry(version).or_default().push(symbol.to_owned());
-            }
+            let symbol = line.split_once(" UND ").and_then(|(_, it)| it.split_once("@GLIBC_"));
+            let need = symbol.or_else(|| line.split_once("Name: GLIBC_"));
+            let Some((_, version)) = need else { continue };
+            let version = version.split_whitespace().next().unwrap_or_default();
+            let Some(version) = GlibcVersion::parse(version) else {
+                needs.formats.push(format!("the format of GLIBC_{version}"));
+                continue;
+            };
+            let symbols = needs.symbols.entry(version).or_default();
+            symbols.extend(symbol.map(|(name, _)| name.to_owned()));
         }
         needs
     }
@@ -64,14 +60,11 @@ impl GlibcNeeds {
     }
 
     /// Returns a sentence for each need that a machine with glibc `limit` does not meet.
-    fn beyond(&self, limit: GlibcVersion) -> Vec<String> {
-        let newer = self.symbols.iter().filter(|(version, _)| **version > limit);
-        let symbols = newer.map(|(version, symbols)| match &symbols[..] {
-            [] => format!("glibc {version}"),
-            symbols => format!("{} of glibc {version}", symbols.join(", ")),
-        });
-        let formats = self.formats.iter().map(|name| format!("the format of {name}"));
-        symbols.chain(formats).collect()
+    fn beyond(&self, limit: GlibcVersion) -> impl Iterator<Item = String> {
+        let newer = self.symbols.iter().filter(move |(version, _)| **version > limit);
+        newer
+            .map(|(version, symbols)| format!("{} of glibc {version}", symbols.join(", ")))
+            .chain(self.formats.iter().cloned())
     }
 }
 
@@ -85,7 +78,7 @@ pub(crate) fn check(
     for file in files.iter().map(AsRef::as_ref) {
         let needs = GlibcNeeds::of(checkout, file)?;
         let name = file.file_name().unwrap_or_default().to_string_lossy();
-        causes.extend(needs.beyond(limit).iter().map(|need| format!("`{name}` needs {need}")));
+        causes.extend(needs.beyond(limit).map(|need| format!("`{name}` needs {need}")));
         newest = newest.max(needs.newest());
     }
     if causes.is_empty() {
@@ -141,7 +134,7 @@ Symbol table '.dynsym' contains 3 entries:
             "pidfd_spawnp of glibc 2.39",
             "the format of GLIBC_ABI_DT_RELR",
         ];
-        assert_eq!(needs.beyond(OF_JETPACK), expected);
+        assert_eq!(needs.beyond(OF_JETPACK).collect::<Vec<_>>(), expected);
         assert_eq!(GlibcNeeds::parse("no dynamic section").newest(), None);
     }
 

@@ -20,8 +20,8 @@ pub(crate) fn run_flows(checkout: &Checkout, arguments: &[OsString]) -> Result<E
     let is_installing = steps::has_flag("page", "--install", arguments)?;
     let folder = checkout.target().join("page");
     let mut steps = Steps::of(4);
-    steps.begin("browser and Node.js");
-    packages(checkout, is_installing)?;
+    steps.begin("browser, and Node.js 20 or newer");
+    steps::require_packages(checkout, "page", is_installing, || missing(checkout))?;
     steps.begin("driver of the browser");
     modules(checkout, &folder)?;
     steps.begin("a cloud with vehicles");
@@ -35,22 +35,6 @@ pub(crate) fn run_flows(checkout: &Checkout, arguments: &[OsString]) -> Result<E
     node.arg(BROWSER).arg(folder.join("screenshots"));
     let help = format!("screenshots are in `{}`", folder.join("screenshots").display());
     run(&mut node, &help).map(|()| Exit::Ok)
-}
-
-fn packages(checkout: &Checkout, is_installing: bool) -> Result<(), Failure> {
-    let missing = missing(checkout);
-    if is_installing && !missing.is_empty() {
-        steps::install(checkout, &missing)?;
-    }
-    let missing = self::missing(checkout);
-    if missing.is_empty() {
-        return Ok(());
-    }
-    let help = format!(
-        "as root: cargo xtask page --install, or: apt-get install {}; Node.js must be 20 or newer",
-        missing.join(" ")
-    );
-    Err(Failure::new(Exit::Unreachable, "packages for the browser are missing").with_help(help))
 }
 
 /// Returns the packages whose programs do not run, or are too old for the driver.

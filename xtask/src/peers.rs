@@ -28,10 +28,8 @@ pub(crate) fn build(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit,
     let peers = Peers { checkout, folder: checkout.target().join("peers") };
     let mut steps = Steps::of(4);
     steps.begin("packages");
-    let missing = peers.missing();
-    if install && !missing.is_empty() {
-        steps::install(checkout, &missing)?;
-    }
+    // Those that can be built are built, whatever is missing for the others.
+    let required = steps::require_packages(checkout, "peers", install, || peers.missing());
     steps.begin("Cyclone DDS in C");
     if peers.has_cyclone() {
         peers.cyclone()?;
@@ -47,13 +45,7 @@ pub(crate) fn build(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit,
     steps.begin("Cyclone DDS in Python");
     peers.python()?;
     println!("peers are in {}", peers.folder.display());
-    let missing = peers.missing();
-    if missing.is_empty() {
-        return Ok(Exit::Ok);
-    }
-    let help =
-        format!("as root: cargo xtask peers --install, or: apt-get install {}", missing.join(" "));
-    Err(Failure::new(Exit::Unreachable, "packages for the DDS peers are missing").with_help(help))
+    required.map(|()| Exit::Ok)
 }
 
 struct Peers<'c> {

@@ -155,7 +155,7 @@ pub(crate) fn full(checkout: &Checkout) -> Result<Exit, Failure> {
     // Those of an earlier run would count if this one ended before it wrote its own.
     steps::remove_folder(&results)?;
     steps::make_folder(&results)?;
-    let mut run = checkout.script(".ci/run");
+    let mut run = checkout.script(checkout.path(".ci/run"));
     let ended = steps::run(
         run.arg("--full").arg(&results),
         "see the first error above; parts that ended before it are recorded",

@@ -57,6 +57,13 @@ pub(crate) fn run(command: &mut Command, help: &str) -> Result<(), Failure> {
     if status.success() { Ok(()) } else { Err(ended(command, &status.to_string(), help)) }
 }
 
+/// Runs a script that prints its own errors, and returns its exit code.
+pub(crate) fn run_script(command: &mut Command) -> Result<Exit, Failure> {
+    let status = command.stdin(Stdio::null()).status();
+    let status = status.map_err(|error| cannot_start(command, &error, "install bash"))?;
+    Ok(status.code().and_then(Exit::from_code).unwrap_or(Exit::Internal))
+}
+
 /// Runs a command that downloads something: if it fails, [`Exit::Unreachable`] marks
 /// that what needs it can be skipped.
 pub(crate) fn download(command: &mut Command, help: &str) -> Result<(), Failure> {
@@ -126,6 +133,27 @@ pub(crate) fn install(checkout: &Checkout, packages: &[&str]) -> Result<(), Fail
     let help = "install packages as root after `apt-get update`; on other systems than Debian and \
                 Ubuntu, install their equivalents";
     download(install.env("DEBIAN_FRONTEND", "noninteractive"), help)
+}
+
+/// Checks that `missing` returns no packages; with `is_installing`, they are installed first. The
+/// command of xtask with this `name` needs them.
+pub(crate) fn require_packages(
+    checkout: &Checkout,
+    name: &str,
+    is_installing: bool,
+    missing: impl Fn() -> Vec<&'static str>,
+) -> Result<(), Failure> {
+    let packages = missing();
+    if is_installing && !packages.is_empty() {
+        install(checkout, &packages)?;
+    }
+    let packages = missing().join(" ");
+    if packages.is_empty() {
+        return Ok(());
+    }
+    let help = format!("as root: cargo xtask {name} --install, or: apt-get install {packages}");
+    let message = format!("packages for `cargo xtask {name}` are missing");
+    Err(Failure::new(Exit::Unreachable, message).with_help(help))
 }
 
 /// Runs `command` and returns its standard output; standard error is shown.

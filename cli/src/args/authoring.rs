@@ -21,7 +21,6 @@ pub struct NewArgs {
 
 /// Language of a lambda.
 #[derive(ValueEnum, Clone, Copy, Debug, PartialEq, Eq)]
-#[allow(missing_docs)]
 pub enum Language {
     Rust,
     Python,

@@ -15,7 +15,6 @@ pub struct ClipsArgs {
     #[command(subcommand)]
     pub command: Option<ClipsCommand>,
     #[command(flatten)]
-    #[allow(missing_docs)]
     pub filter: ClipFilterArgs,
     /// Number of the clips to list, the last announced ones
     #[arg(long, short = 'n', value_name = "N", default_value_t = 100)]
@@ -90,7 +89,6 @@ pub struct PullArgs {
 #[derive(Args, Debug)]
 pub struct ExportArgs {
     #[command(flatten)]
-    #[allow(missing_docs)]
     pub filter: ClipFilterArgs,
     /// Folder for the files: DIR/events.jsonl and DIR/VEHICLE/NAME.mcap
     #[arg(long, value_name = "DIR")]

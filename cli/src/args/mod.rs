@@ -118,7 +118,6 @@ pub enum CliCommand {
     /// Show what happened on a vehicle
     Events(StreamArgs),
     #[command(flatten)]
-    #[allow(missing_docs)]
     Cloud(CloudCommand),
     /// Check whether lambdas can run well on this machine
     Doctor(DoctorArgs),
@@ -154,7 +153,6 @@ pub struct LambdaArgs {
 }
 
 impl LambdaArgs {
-    /// Returns the settings as arguments of the other programs.
     pub(crate) fn settings(&self) -> Vec<OsString> {
         let pairs = |flag: &'static str, values: &[String]| {
             values.iter().flat_map(|value| [flag.into(), value.into()]).collect::<Vec<OsString>>()
@@ -180,7 +178,6 @@ pub struct NetworkArgs {
 }
 
 impl NetworkArgs {
-    /// Returns the network as arguments of the other programs.
     pub(crate) fn to_args(&self) -> impl Iterator<Item = OsString> {
         let domain = self.domain.map(|domain| format!("--domain={domain}"));
         let interfaces = self.interface.iter().map(|address| format!("--interface={address}"));
@@ -250,7 +247,6 @@ pub struct RunArgs {
     #[arg(long, value_name = "BYTES", value_parser = bytes)]
     pub bytes_max: Option<u64>,
     #[command(flatten)]
-    #[allow(missing_docs)]
     pub sign: SignArgs,
     /// Receive with real-time priority, where the system permits it; see docs/live.md
     #[arg(long, conflicts_with = "drive")]
@@ -263,7 +259,6 @@ pub struct RunArgs {
     #[arg(long, conflicts_with = "stats")]
     pub json: bool,
     #[command(flatten)]
-    #[allow(missing_docs)]
     pub network: NetworkArgs,
 }
 
@@ -294,7 +289,6 @@ pub struct TopicsArgs {
     #[arg(long)]
     pub json: bool,
     #[command(flatten)]
-    #[allow(missing_docs)]
     pub network: NetworkArgs,
 }
 
@@ -310,7 +304,6 @@ pub struct DoctorArgs {
 #[derive(Args, Debug)]
 pub struct CheckArgs {
     #[command(flatten)]
-    #[allow(missing_docs)]
     pub target: LambdaArgs,
     /// Only build the engines of its models for TensorRT, which takes minutes for each
     #[arg(long)]
@@ -324,7 +317,6 @@ pub struct CheckArgs {
 #[derive(Args, Clone, Debug)]
 pub struct ReplayedArgs {
     #[command(flatten)]
-    #[allow(missing_docs)]
     pub target: LambdaArgs,
     /// MCAP files, rosbag2 .db3 files and directories, plain or compressed with zstd; separate
     /// drives are replayed one by one, each with results in a folder of OUT/drives
@@ -359,7 +351,6 @@ impl ReplayedArgs {
 #[derive(Args, Clone, Debug)]
 pub struct ReplayArgs {
     #[command(flatten)]
-    #[allow(missing_docs)]
     pub replayed: ReplayedArgs,
     /// Write every decision, not only those with a trigger or a fault
     #[arg(long)]

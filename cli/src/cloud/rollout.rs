@@ -29,7 +29,6 @@ pub(super) struct Rollout {
     pub(super) selector: Selector,
     /// SHA-256 of the signed envelope that runs then; `None` if there may be several.
     pub(super) envelope: Option<String>,
-    /// The state that each should reach.
     pub(super) goal: Goal,
     /// The vehicles that it concerns; those that match meanwhile count, too.
     pub(super) plan: FleetPlan,

@@ -5,7 +5,6 @@ use gleaner_protocol::{Holds, Layer};
 
 use super::{Finding, Severity, output_of};
 
-/// Returns a finding for each layer.
 pub(super) fn findings(parts: &Parts) -> Vec<Finding> {
     match layers(parts) {
         Ok(layers) => layers.iter().map(finding).collect(),

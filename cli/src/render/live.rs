@@ -32,7 +32,6 @@ pub(crate) fn named_report(lambda: &str, report: &Report) -> Value {
     named.into()
 }
 
-/// Formats the live topics as a table.
 pub(crate) fn topics(topics: &[TopicInfo]) -> String {
     if topics.is_empty() {
         return "no topics; compare ROS_DOMAIN_ID with that of the nodes, and run `gleaner doctor`\n"
@@ -50,7 +49,6 @@ pub(crate) fn topics(topics: &[TopicInfo]) -> String {
     table(&["topic", "type", "writers", "readers", "QoS"], rows, &[2, 3])
 }
 
-/// Formats a clip that was just completed.
 pub(crate) fn clip_line(clip: &Clip, paint: Paint) -> String {
     let [from, to] = clip_span(clip).map(time_of_day);
     written(|text| super::clips::one(text, clip, &format!("{from} to {to}  clip"), paint))

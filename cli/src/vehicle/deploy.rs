@@ -42,13 +42,10 @@ pub(crate) struct LocalRevision {
 /// A deployment that is about to be signed.
 pub(crate) struct NextDeployment {
     pub(crate) deployment: Deployment,
-    /// Lines on what it changes.
     changes: Vec<String>,
 }
 
-/// A deployment that was accepted.
 pub(crate) struct SentDeployment {
-    /// Number of its attempt on a vehicle.
     attempt: u64,
     /// SHA-256 of its envelope.
     pub(crate) envelope: String,

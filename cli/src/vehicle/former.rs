@@ -116,7 +116,6 @@ impl Former {
         Some(Fallback { digest: &runs.digest, known: Some(runs) })
     }
 
-    /// Returns its revision.
     pub(crate) fn revision(&self) -> Option<&Revision> {
         self.revisions.first().map(|it| &it.revision)
     }
@@ -151,7 +150,6 @@ impl<'f> Fallback<'f> {
         chosen.filter(|chosen| chosen.digest != digest)
     }
 
-    /// Returns its manifest, if it is known here.
     pub(crate) fn manifest(&self) -> Option<&'f Manifest> {
         self.known.map(|known| &known.manifest)
     }

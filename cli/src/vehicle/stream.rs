@@ -164,7 +164,6 @@ fn gap_words(first: u64, record: &Value) -> String {
     format!("records {first} to {last} are missing: {reason}")
 }
 
-/// Returns the reason of a gap in words.
 pub(super) fn gap_reason(reason: &str) -> &'static str {
     match reason {
         "Budget" | "Retention" => "newer ones took their room",

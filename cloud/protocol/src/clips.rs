@@ -9,6 +9,7 @@
 use std::fmt;
 use std::str::FromStr;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
@@ -34,9 +35,8 @@ const TEXT_MAX: usize = 256;
 const NAME_MAX: usize = 200;
 
 /// The name of a clip at its vehicle, without `.mcap`. It is always safe as a part of a path.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, JsonSchema)]
 #[serde(try_from = "String", into = "String")]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct ClipName(String);
 
 impl ClipName {
@@ -82,9 +82,8 @@ impl From<ClipName> for String {
 }
 
 /// The id of a clip in the fleet: `NAME@VEHICLE`.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, JsonSchema)]
 #[serde(try_from = "String", into = "String")]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct ClipId {
     name: ClipName,
     vehicle: ClipName,
@@ -148,8 +147,7 @@ impl From<ClipId> for String {
 }
 
 /// The facts of a clip, as its vehicle states them.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct ClipFacts {
     /// Its name.
     pub name: ClipName,
@@ -181,8 +179,7 @@ pub struct ClipFacts {
 }
 
 /// A lambda of a clip.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct RecordedLambda {
     /// Its name.
     pub name: String,
@@ -197,8 +194,7 @@ pub struct RecordedLambda {
 }
 
 /// A trigger or a command of a clip.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct ClipMoment {
     /// Name of the lambda.
     pub lambda: String,
@@ -295,7 +291,7 @@ impl ClipFacts {
 }
 
 /// A report of a vehicle about its clips.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct ClipReport {
     /// Its position in its list of clips after these; `None` if it only asks for orders.
     pub cursor: Option<String>,
@@ -306,7 +302,7 @@ pub struct ClipReport {
 }
 
 /// A clip whose file is not there any more.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct GoneClip {
     /// Its name.
     pub name: ClipName,
@@ -317,7 +313,7 @@ pub struct GoneClip {
 }
 
 /// Everything that the cloud wants of the clips of a vehicle.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct ClipOrders {
     /// The newest position that is durable.
     pub cursor: Option<String>,
@@ -335,7 +331,7 @@ pub struct ClipOrders {
 }
 
 /// Bytes of clips that a vehicle may send in a day, those that do not arrive too.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct ClipBudget {
     /// Number of the day, by the clock of the cloud: with another one, the count begins again.
     pub day: u64,
@@ -347,7 +343,7 @@ pub struct ClipBudget {
 }
 
 /// A clip whose file the cloud wants.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct WantedClip {
     /// Its name.
     pub name: ClipName,
@@ -363,8 +359,7 @@ pub struct WantedClip {
 }
 
 /// A clip of the fleet.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct FleetClip {
     /// Its id.
     pub id: ClipId,
@@ -384,9 +379,8 @@ pub struct FleetClip {
 }
 
 /// The place of the file of a clip.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub enum ClipState {
     /// On its vehicle only.
     OnVehicle,
@@ -417,9 +411,8 @@ impl ClipState {
 }
 
 /// Rules for the upload of clips of the fleet.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct ClipPolicy {
     /// The clips that are uploaded.
     pub upload: UploadedClips,
@@ -436,8 +429,7 @@ pub struct ClipPolicy {
 }
 
 /// The clips in the cloud, and those that were removed.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct ClipUsage {
     /// Number of clips that are stored.
     pub stored: u64,
@@ -454,9 +446,8 @@ pub struct ClipUsage {
 }
 
 /// The clips that vehicles upload.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub enum UploadedClips {
     /// All of them.
     All,

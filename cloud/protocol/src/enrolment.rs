@@ -10,9 +10,8 @@ const ENROLMENT_MAX: usize = 64 << 10;
 
 /// The means to connect for the first time: the content of the file that
 /// `gleaner vehicles enrol` writes. It is a secret until it was used.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Enrolment {
     /// Version of this format: 1.
     pub gleaner_enrolment: u32,
@@ -54,7 +53,7 @@ impl Enrolment {
 }
 
 /// A request for the first certificate: `POST /v1/enrol` at the address for vehicles.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct EnrolRequest {
     /// Name of the vehicle.
@@ -66,7 +65,7 @@ pub struct EnrolRequest {
 }
 
 /// A request for the next certificate: `POST /v1/renew`, with the current one.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct RenewRequest {
     /// The request for a certificate, as PEM.
@@ -74,7 +73,7 @@ pub struct RenewRequest {
 }
 
 /// The answer to both requests.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct EnrolReply {
     /// The certificate, as PEM.
     pub certificate: String,

@@ -375,14 +375,6 @@ mod tests {
     }
 
     #[test]
-    fn a_frame_is_decoded_as_it_was_encoded() {
-        let deployments = vec![wanted("a"), wanted("b")];
-        let desired = Desired { generation: 7, deployments, keeps: true };
-        let bytes = Frame::encoded(Body::Desired(desired.clone()));
-        assert_eq!(Frame::decoded(&bytes).unwrap().body, Some(Body::Desired(desired)));
-    }
-
-    #[test]
     fn a_frame_of_a_later_version_is_empty_and_bad_bytes_are_refused() {
         // Field 200, with a message of one byte.
         let later = [0xc2, 0x0c, 1, 0];

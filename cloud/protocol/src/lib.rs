@@ -4,13 +4,15 @@
 //! `enrolment` has the messages by which a vehicle gets its certificate, and `people` those of the
 //! API for people; `waves` is the part of it by which a release reaches vehicles step by step.
 //! `clips` has those about recorded clips, and `records` those of a search. `object` checks files
-//! that are sent. Nothing here opens a connection; with the feature of that name, `entrance`
-//! accepts those of clients.
+//! that are sent. Nothing here opens a connection; with the features of these names, `entrance`
+//! accepts those of clients, and `openapi` describes an API for other programs.
 //!
 //! A vehicle is given the complete wanted state, never a change of it: a list of deployments, each
 //! by the digest of its signed envelope. It fetches envelopes and files that it lacks by HTTPS from
 //! the same address, and verifies all of them by its own trust root. What it has recorded goes up
 //! in batches, and counts as delivered once the cloud has acknowledged it.
+
+#![warn(missing_docs)]
 
 pub mod clips;
 mod enrolment;
@@ -18,6 +20,8 @@ mod enrolment;
 pub mod entrance;
 mod frame;
 mod object;
+#[cfg(feature = "openapi")]
+pub mod openapi;
 pub mod people;
 mod problem;
 pub mod records;
@@ -33,3 +37,6 @@ pub use frame::{
 };
 pub use object::{AnnouncedFile, UnfinishedFile};
 pub use problem::{CAUSES_MAX, PROBLEM_TEXT_MAX, PROBLEMS_MAX, WantedProblem, problem_text};
+
+#[cfg(test)]
+mod tests;

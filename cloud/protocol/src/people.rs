@@ -10,15 +10,15 @@ use std::fmt;
 use std::str::FromStr;
 
 use gleaner_protocol::vehicle_api::GrantStatus;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::WantedProblem;
 use crate::waves::{WavePlan, WaveProgress};
 
 /// A part of a list that can grow: `?after=CURSOR&limit=N`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
-#[cfg_attr(feature = "schema", schemars(rename = "ListPageOf{T}"))]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[schemars(rename = "ListPageOf{T}")]
 pub struct ListPage<T> {
     /// The entries.
     pub items: Vec<T>,
@@ -38,9 +38,10 @@ impl<T> ListPage<T> {
 }
 
 /// The rights of a user. Each has those of the ones before.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, JsonSchema,
+)]
 #[serde(rename_all = "lowercase")]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub enum Role {
     /// May read everything but the audit trail and users.
     Viewer,
@@ -83,17 +84,15 @@ impl FromStr for Role {
 }
 
 /// A request for a token, by the one-time code of an invitation.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Login {
     /// The code.
     pub code: String,
 }
 
 /// A token of a user. It is not shown again.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct UserToken {
     /// The user.
     pub user: User,
@@ -107,8 +106,7 @@ pub struct UserToken {
 pub const TOKEN_DAYS_MAX: u32 = 366;
 
 /// A request for a token for programs.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct NewToken {
     /// The name, one of the user's.
@@ -120,8 +118,7 @@ pub struct NewToken {
 }
 
 /// A token for programs, without the token itself.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct TokenSummary {
     /// The user who has made it.
     pub user: String,
@@ -134,8 +131,7 @@ pub struct TokenSummary {
 }
 
 /// A user.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct User {
     /// The name.
     pub name: String,
@@ -144,9 +140,8 @@ pub struct User {
 }
 
 /// A request to add a user, or to invite one again.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct NewUser {
     /// The name.
     pub name: String,
@@ -155,8 +150,7 @@ pub struct NewUser {
 }
 
 /// An invitation of a user.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct Invitation {
     /// The user.
     pub user: User,
@@ -167,17 +161,15 @@ pub struct Invitation {
 }
 
 /// A request to enrol a vehicle.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct NewVehicle {
     /// The name.
     pub name: String,
 }
 
 /// A vehicle in a list.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct VehicleSummary {
     /// The name.
     pub name: String,
@@ -212,9 +204,8 @@ pub struct VehicleSummary {
 }
 
 /// The state of a vehicle, as the cloud sees it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub enum VehicleState {
     /// It was invited, and has not connected yet.
     Invited,
@@ -227,9 +218,8 @@ pub enum VehicleState {
 }
 
 /// A deployment for the fleet: as for one vehicle, and with a plan of its waves.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct FleetDeployRequest {
     /// The envelope of the deployment.
     pub deployment: String,
@@ -242,8 +232,7 @@ pub struct FleetDeployRequest {
 
 /// The highest release of a deployment that a vehicle has reported, also of one that was removed or
 /// that the cloud does not have. It is unsigned, and so a hint.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct ReportedRelease {
     /// The vehicle.
     pub vehicle: String,
@@ -252,8 +241,7 @@ pub struct ReportedRelease {
 }
 
 /// A deployment of the fleet.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct FleetDeployment {
     /// Its id.
     pub id: String,
@@ -294,8 +282,7 @@ pub struct FleetDeployment {
 }
 
 /// An entry of the audit trail.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct AuditEntry {
     /// Number of the entry.
     pub seq: u64,

@@ -11,9 +11,8 @@ pub const CAUSES_MAX: usize = 8;
 pub const PROBLEM_TEXT_MAX: usize = 300;
 
 /// The reason why a wanted deployment is not applied.
-#[derive(Clone, PartialEq, Eq, Hash, Message, Serialize, Deserialize)]
+#[derive(Clone, PartialEq, Eq, Hash, Message, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(default)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct WantedProblem {
     /// Id of the deployment.
     #[prost(string, tag = "1")]

@@ -4,8 +4,7 @@ use gleaner_protocol::vehicle_api::StreamLine;
 use serde::{Deserialize, Serialize};
 
 /// A record that a search has found, with its vehicle.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct FoundRecord {
     /// The vehicle.
     pub vehicle: String,
@@ -15,8 +14,7 @@ pub struct FoundRecord {
 
 /// A part of what a search finds: of each vehicle the newest first, and all of a vehicle before the
 /// next one.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct FoundRecords {
     /// The records; a part may have none, and still go on.
     pub items: Vec<FoundRecord>,

@@ -9,9 +9,8 @@ pub const WAVES_MAX: usize = 20;
 const SECONDS_MAX: u64 = 366 * 86_400;
 
 /// The plan by which a release reaches its vehicles.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct WavePlan {
     /// The share of its vehicles that each wave reaches, with those before, in percent. One more
     /// wave reaches all.
@@ -29,9 +28,8 @@ pub struct WavePlan {
 }
 
 /// The action when too many vehicles fail.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "lowercase")]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub enum OnFailure {
     /// The release reaches no more vehicles until a person decides.
     Pause,
@@ -40,9 +38,8 @@ pub enum OnFailure {
 }
 
 /// The state of the waves of a release.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "lowercase")]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub enum WaveState {
     /// The next wave opens once this one has succeeded.
     Running,
@@ -53,8 +50,7 @@ pub enum WaveState {
 }
 
 /// The progress of a release that has not reached all its vehicles.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct WaveProgress {
     /// The plan.
     pub plan: WavePlan,

@@ -101,7 +101,6 @@ impl Default for VehicleLimits {
 }
 
 impl VehicleLimits {
-    /// Counts a request of a vehicle.
     pub(crate) fn request(&self, vehicle: &str) -> CloudResult<()> {
         within(&self.requests, vehicle, "requests")
     }
@@ -111,7 +110,6 @@ impl VehicleLimits {
         within(&self.links, vehicle, "connections")
     }
 
-    /// Counts a request of a vehicle for another certificate.
     pub(crate) fn renewal(&self, vehicle: &str) -> CloudResult<()> {
         within(&self.renewals, vehicle, "requests for a certificate")
     }

@@ -34,7 +34,6 @@ const RECONNECT_MAX: Duration = Duration::from_secs(2);
 pub(crate) enum Hint {
     /// The connections or the wanted states of these vehicles.
     Vehicles(Vec<String>),
-    /// The records of a vehicle.
     Records(String),
     /// The leases of streams that people read.
     Tails,
@@ -63,7 +62,6 @@ pub(crate) struct Bus {
     dropped: AtomicU64,
 }
 
-/// The address of a NATS server.
 #[derive(Debug, Clone)]
 pub(crate) struct BusAddress(ServerAddr);
 

@@ -25,7 +25,6 @@ pub(crate) struct LinkOrders {
     pub(crate) generation: u64,
     /// The streams that people read.
     pub(crate) tail: Arc<VehicleTail>,
-    /// The end of the connection.
     pub(crate) end: Option<GoAway>,
 }
 
@@ -224,7 +223,6 @@ impl Hub {
         }
     }
 
-    /// Returns the vehicles whose records are read.
     pub(crate) fn read_vehicles(&self) -> BTreeSet<String> {
         let mut state = self.lock();
         state.arrivals.retain(|_, sender| sender.receiver_count() > 0);

@@ -43,5 +43,8 @@ mod ticks;
 mod transfer;
 mod vehicles;
 
+#[cfg(test)]
+use vehicles::endpoints as endpoints_for_vehicles;
+
 pub use program::main;
 pub use server::{CloudServer, ServeOptions};

@@ -24,7 +24,6 @@ use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 use crate::folder::PART;
 use crate::place::{FilePlace, blocking};
-use crate::readers::ReaderSlot;
 use crate::store::CloudStore;
 use crate::transfer::{IncomingFile, OCTETS, OutgoingFile, PIECE_TIME};
 
@@ -144,7 +143,7 @@ impl Objects {
     /// Returns the answer with a file, or with the end of it.
     pub(crate) async fn send(
         &self,
-        slot: ReaderSlot,
+        slot: impl Send + 'static,
         sha256: &Sha256,
         headers: &HeaderMap,
     ) -> CloudResult<Response> {

@@ -53,7 +53,6 @@ enum CloudCommand {
     },
 }
 
-/// Runs the program.
 pub fn main() -> ExitCode {
     log::init_service();
     // Each connection takes one; the usual limit is low.

@@ -87,7 +87,6 @@ impl Readers {
         Ok(ReaderSlot { readers: Arc::clone(self), user: user.to_owned(), ended })
     }
 
-    /// Ends all streams of a user.
     pub(crate) fn end(&self, user: &str) {
         if let Some(of_user) = self.lock().get(user) {
             of_user.end.send_replace(());
@@ -100,12 +99,10 @@ impl Readers {
 }
 
 impl ReaderSlot {
-    /// Returns whether the stream has to end.
     pub(crate) fn has_ended(&self) -> bool {
         self.ended.has_changed().unwrap_or(true)
     }
 
-    /// Waits until the stream has to end.
     pub(crate) async fn ended(&mut self) {
         // It stays changed, so that no later look misses it.
         while !self.has_ended() {
@@ -114,7 +111,6 @@ impl ReaderSlot {
     }
 }
 
-/// The token by which a stream is read.
 pub(crate) struct ReaderToken {
     token: String,
     user: String,

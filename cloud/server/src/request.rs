@@ -74,7 +74,6 @@ pub(crate) async fn in_time(request: Request, next: Next) -> Response {
     })
 }
 
-/// Parses the body of a request.
 pub(crate) fn parsed<T: DeserializeOwned>(body: &Bytes, what: &str) -> CloudResult<T> {
     serde_json::from_slice(body).map_err(|error| {
         let help = "use a version of gleaner that fits the one of the cloud";

@@ -46,7 +46,6 @@ const DESCRIPTORS_KEPT: usize = 64;
 const UNREAD_MS: u32 = if cfg!(test) { 1000 } else { 60_000 };
 /// Interval at which times of signs of life are stored.
 const SEEN_INTERVAL: Duration = Duration::from_secs(30);
-/// Interval at which waves of releases are looked at.
 const WAVES_INTERVAL: Duration = Duration::from_secs(2);
 /// Time after which the server's certificate is made again, in s, and the interval of looks: a
 /// clock that was set by more has made one with a wrong end.
@@ -134,11 +133,8 @@ impl ServeOptions {
     }
 }
 
-/// A server that runs.
 pub struct CloudServer {
-    /// Address of the API for people.
     pub people: SocketAddr,
-    /// Address for vehicles.
     pub vehicles: SocketAddr,
     /// The one-time code of an administrator, unless one has a valid token.
     pub code: Option<String>,

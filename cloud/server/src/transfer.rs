@@ -18,7 +18,6 @@ use tokio::time::{Instant, timeout, timeout_at};
 
 use crate::error::{CloudError, CloudResult};
 
-/// Time for the next piece of a file.
 pub(crate) const PIECE_TIME: Duration = Duration::from_secs(60);
 /// Slowest rate of a whole file, in bytes/s.
 const RATE_MIN: u64 = 14_000;
@@ -129,7 +128,6 @@ pub(crate) struct OutgoingFile<'f> {
     pub(crate) kind: &'static str,
     /// The way to get it, if it is not there.
     pub(crate) help: &'f str,
-    /// Its SHA-256, if it is known.
     pub(crate) sha256: Option<&'f str>,
 }
 

@@ -1,5 +1,5 @@
 """Parses the parts of `lambda.toml` that a local replay needs. `gleaner build` parses all of it,
-and is stricter in places."""
+and is stricter in places. Its parser is in Rust, and a local replay needs no program of Gleaner."""
 
 from __future__ import annotations
 

@@ -12,23 +12,7 @@ pub(crate) mod gleaner {
 }
 
 use self::gleaner::lambda::data::Wake;
-
-/// One entry of `[config]`.
-#[derive(Clone, Debug)]
-pub struct ConfigEntry {
-    pub(crate) key: String,
-    pub(crate) value: ConfigValue,
-}
-
-/// Value of a `[config]` entry.
-#[derive(Clone, Debug, PartialEq)]
-#[allow(missing_docs)]
-pub enum ConfigValue {
-    Boolean(bool),
-    Integer(i64),
-    Real(f64),
-    Text(String),
-}
+pub use crate::generated::{ConfigEntry, ConfigValue};
 
 /// Functions that a component exports.
 #[allow(missing_docs, clippy::missing_errors_doc)]

@@ -147,32 +147,11 @@ impl Host {
 #[derive(Clone, Debug)]
 pub struct Setting(ConfigValue);
 
-impl From<bool> for Setting {
-    fn from(value: bool) -> Self {
-        Self(ConfigValue::Boolean(value))
-    }
-}
-
-impl From<i32> for Setting {
-    fn from(value: i32) -> Self {
-        Self(ConfigValue::Integer(value.into()))
-    }
-}
-
-impl From<i64> for Setting {
-    fn from(value: i64) -> Self {
-        Self(ConfigValue::Integer(value))
-    }
-}
-
-impl From<f64> for Setting {
-    fn from(value: f64) -> Self {
-        Self(ConfigValue::Real(value))
-    }
-}
-
-impl From<&str> for Setting {
-    fn from(value: &str) -> Self {
-        Self(ConfigValue::Text(value.to_owned()))
-    }
+conversions! {
+    Setting:
+    bool => |value| ConfigValue::Boolean(value),
+    i32 => |value| ConfigValue::Integer(value.into()),
+    i64 => |value| ConfigValue::Integer(value),
+    f64 => |value| ConfigValue::Real(value),
+    &str => |value| ConfigValue::Text(value.to_owned()),
 }

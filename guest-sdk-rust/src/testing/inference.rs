@@ -222,30 +222,15 @@ impl Model {
 
 /// Refuses the frames that no model gets as its input.
 fn check_frame(frame: &Frame) -> CallResult<()> {
+    use Encoding::{Bgr8, Bgra8, Mono8, Rgb8, Rgba8, Yuv422, Yuv422Yuy2};
     let encoding = frame.info().encoding;
-    match encoding {
-        Encoding::Rgb8
-        | Encoding::Bgr8
-        | Encoding::Rgba8
-        | Encoding::Bgra8
-        | Encoding::Mono8
-        | Encoding::Yuv422
-        | Encoding::Yuv422Yuy2 => Ok(()),
-        Encoding::Mono16
-        | Encoding::BayerRggb8
-        | Encoding::BayerBggr8
-        | Encoding::BayerGbrg8
-        | Encoding::BayerGrbg8
-        | Encoding::BayerRggb16
-        | Encoding::BayerBggr16
-        | Encoding::BayerGbrg16
-        | Encoding::BayerGrbg16 => {
-            let name = encoding_name(encoding);
-            Err(InferenceError::WrongInput(format!(
-                "a frame of {name} cannot be the input of a model; 8-bit colour and grey can"
-            )))
-        }
+    if [Rgb8, Bgr8, Rgba8, Bgra8, Mono8, Yuv422, Yuv422Yuy2].contains(&encoding) {
+        return Ok(());
     }
+    let name = encoding_name(encoding);
+    Err(InferenceError::WrongInput(format!(
+        "a frame of {name} cannot be the input of a model; 8-bit colour and grey can"
+    )))
 }
 
 fn element_size(element: ElementType) -> usize {

@@ -5,21 +5,7 @@ use gleaner_rules::log::{Rate, line};
 
 use super::manifest::Limits;
 use super::session::current;
-
-/// Severity of a log line.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum Level {
-    /// The operator must act.
-    Error,
-    /// Data or time was lost.
-    Warn,
-    /// A state changed.
-    Info,
-    /// For the lambda's author.
-    Debug,
-    /// For the lambda's author, in detail.
-    Trace,
-}
+pub use crate::generated::gleaner::lambda::log::Level;
 
 /// One line of the log.
 #[derive(Clone, Debug, PartialEq, Eq)]

@@ -1,5 +1,6 @@
 //! Parses the parts of `lambda.toml` that the fake host needs. `gleaner build` parses all of it,
-//! and is stricter in places.
+//! and is stricter in places. Its parser, `gleaner-lambda`, would make the first `cargo test` of a
+//! lambda compile 38 crates instead of 10, in 42 s of CPU time instead of 12 s.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -301,7 +302,8 @@ impl ConfigItem {
                     ConfigValue::Real(_) => "a finite number",
                     ConfigValue::Text(_) => "a text",
                 };
-                let what = format!("config value `{}` cannot be {given:?}", self.name);
+                let given = format!("{given:?}").replacen("ConfigValue::", "", 1);
+                let what = format!("config value `{}` cannot be {given}", self.name);
                 return Err(Error::new(what, "", format!("use {wanted}")));
             }
         };

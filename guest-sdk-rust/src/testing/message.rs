@@ -152,17 +152,8 @@ impl fmt::Debug for Message {
 #[derive(Clone, Debug)]
 pub struct FieldValue(Value);
 
-macro_rules! field_value {
-    ($($from:ty => |$value:ident| $make:expr),+ $(,)?) => {
-        $(impl From<$from> for FieldValue {
-            fn from($value: $from) -> Self {
-                Self($make)
-            }
-        })+
-    };
-}
-
-field_value! {
+conversions! {
+    FieldValue:
     bool => |value| Value::Boolean(value),
     i8 => |value| Value::Signed(value.into()),
     i16 => |value| Value::Signed(value.into()),

@@ -274,26 +274,18 @@ fn dropped<L>(session: &Arc<Session>, lambda: Option<L>) -> Result<(), Fault> {
 }
 
 fn cause(at_ns: i64, due: &DueWake) -> Decision {
-    let (triggers, fault) = (Vec::new(), None);
-    match due {
-        DueWake::Tick(_) => Decision {
-            at_ns,
-            cause: Cause::Tick,
-            input: None,
-            topic: None,
-            seq: None,
-            triggers,
-            fault,
-        },
-        DueWake::Event(source, cell) => Decision {
-            at_ns,
-            cause: Cause::Event,
-            input: Some(source.declared.name.clone()),
-            topic: Some(source.declared.topic.clone()),
-            seq: Some(cell.sample.seq),
-            triggers,
-            fault,
-        },
+    let (cause, woken_by) = match due {
+        DueWake::Tick(_) => (Cause::Tick, None),
+        DueWake::Event(source, cell) => (Cause::Event, Some((&source.declared, cell.sample.seq))),
+    };
+    Decision {
+        at_ns,
+        cause,
+        input: woken_by.map(|(declared, _)| declared.name.clone()),
+        topic: woken_by.map(|(declared, _)| declared.topic.clone()),
+        seq: woken_by.map(|(_, seq)| seq),
+        triggers: Vec::new(),
+        fault: None,
     }
 }
 

@@ -1,6 +1,6 @@
 //! Frames in the fake host: pixels, slots and limits.
 
-use gleaner_sdk::data::{Encoding, Roi};
+use gleaner_sdk::data::{DataErrorKind, Encoding, Roi};
 use gleaner_sdk::testing::Message;
 use gleaner_sdk::{Error, Frame, Result};
 
@@ -35,7 +35,7 @@ fn operations_read_the_pixels_and_errors_have_a_kind() {
         assert_eq!((frame.info().size, frame.read(5, 4)), (14, vec![0, 99, 99, 0]));
         let outside = frame.mean_luma(Some(Roi { x: 2, y: 0, width: 1, height: 1 }));
         for refused in [outside.map(drop), frame.resize(0, 1).map(drop)] {
-            assert_eq!(refused.unwrap_err().kind(), Some("out-of-range"));
+            assert!(refused.unwrap_err().is(DataErrorKind::OutOfRange));
         }
         Ok(())
     });
@@ -45,7 +45,7 @@ fn operations_read_the_pixels_and_errors_have_a_kind() {
     assert_eq!(run.faults().next(), None);
 
     let mut run = on_event(camera(false, ""), |sample| {
-        assert_eq!(sample.as_frame()?.mean_luma(None).unwrap_err().kind(), Some("not-a-frame"));
+        assert!(sample.as_frame()?.mean_luma(None).unwrap_err().is(DataErrorKind::NotAFrame));
         Ok(())
     });
     run.deliver("camera", 0, Message::image(2, 1, Encoding::BayerRggb8, [1, 2])).unwrap();
@@ -130,7 +130,7 @@ fn frames_and_their_bytes_are_limited_and_released() {
         let large = frame.resize(1000, 1000)?;
         assert_eq!(large.info().size, 1_000_000);
         let (kind, why) = refused(frame.resize(300, 300)).ok_or(Error::new("there is room"))?;
-        assert_eq!(kind, Some("no-room"));
+        assert_eq!(kind, Some(DataErrorKind::NoRoom.into()));
         assert!(
             why.contains("a new frame or tensor needs 90000 bytes, and 48576 are left"),
             "{why}"

@@ -1,6 +1,6 @@
 //! Messages and their fields, as a lambda reads them in the fake host.
 
-use gleaner_sdk::data::Value;
+use gleaner_sdk::data::{DataErrorKind, Value};
 use gleaner_sdk::testing::{FaultKind, Message};
 use gleaner_sdk::{Error, Result, Sample, input};
 
@@ -53,7 +53,7 @@ fn reading_a_missing_field_is_refused_by_name() {
     let mut run = on_event(imu("", ""), |sample| {
         let imu = input("imu")?;
         let error = sample.number(&imu.field("linear_aceleration.x")?).unwrap_err();
-        assert_eq!(error.kind(), Some("no-such-field"));
+        assert!(error.is(DataErrorKind::NoSuchField));
         let error = imu.column(&imu.field("linear_aceleration.x")?, 1).unwrap_err();
         Err(error)
     });
@@ -74,14 +74,14 @@ fn a_blank_message_defines_the_fields_and_their_defaults() {
     let mut run = on_event(imu("", "").blank("imu", blank), |sample| {
         let imu = input("imu")?;
         let error = imu.field("z").err().ok_or(Error::new("there is a z"))?;
-        assert_eq!(error.kind(), Some("no-such-field"));
+        assert!(error.is(DataErrorKind::NoSuchField));
         assert_eq!(
             [sample.number(&imu.field("x")?)?, sample.number(&imu.field("y")?)?],
             [2.0, 5.0]
         );
         let error =
             imu.column(&imu.field("name")?, 1).err().ok_or(Error::new("a name is a number"))?;
-        assert_eq!(error.kind(), Some("wrong-field"));
+        assert!(error.is(DataErrorKind::WrongField));
         Ok(())
     });
     // A whole number is accepted for a number.
@@ -131,12 +131,12 @@ fn fields_of_another_input_and_malformed_paths_are_refused() {
     let more = "[[input]]\nname = \"speed\"\ntopic = \"/speed\"\ntype = \"car/msg/Speed\"\n";
     let mut run = on_event(imu("", more), |sample| {
         let (imu, speed) = (input("imu")?, input("speed")?);
-        let kind = |error: Option<Error>| error.and_then(|error| error.kind());
-        assert_eq!(kind(sample.number(&speed.field("x")?).err()), Some("wrong-field"));
-        assert_eq!(kind(speed.column(&imu.field("x")?, 1).err()), Some("wrong-field"));
-        assert_eq!(kind(imu.field("a..b").err()), Some("no-such-field"));
-        assert_eq!(kind(imu.field(&"x".repeat(1025)).err()), Some("wrong-field"));
-        assert_eq!(kind(sample.as_frame().err()), Some("not-a-frame"));
+        let is = |error: Option<Error>, kind| error.is_some_and(|error| error.is(kind));
+        assert!(is(sample.number(&speed.field("x")?).err(), DataErrorKind::WrongField));
+        assert!(is(speed.column(&imu.field("x")?, 1).err(), DataErrorKind::WrongField));
+        assert!(is(imu.field("a..b").err(), DataErrorKind::NoSuchField));
+        assert!(is(imu.field(&"x".repeat(1025)).err(), DataErrorKind::WrongField));
+        assert!(is(sample.as_frame().err(), DataErrorKind::NotAFrame));
         assert!(speed.newest().is_none());
         Ok(())
     });

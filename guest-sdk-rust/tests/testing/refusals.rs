@@ -1,6 +1,8 @@
 //! Errors and faults of the fake host, with their texts.
 
+use gleaner_sdk::scratch::ScratchErrorKind;
 use gleaner_sdk::testing::{FaultKind, Host, Message};
+use gleaner_sdk::trigger::TriggerErrorKind;
 use gleaner_sdk::{Error, event, input, log, scratch, stop};
 
 use super::lambda::{TestLambda, imu, manifest, on_event};
@@ -9,11 +11,11 @@ use super::lambda::{TestLambda, imu, manifest, on_event};
 fn triggers_are_checked_and_counted() {
     let mut run = on_event(imu("", "[limits]\nevents_per_minute = 18"), |sample| {
         let refused = |result: gleaner_sdk::Result<()>| {
-            result.err().map(|error| (error.kind(), error.to_string()))
+            result.err().map(|error| (error.kind().unwrap(), error.to_string()))
         };
         if sample.identity().seq == 1 {
             let (kind, why) = refused(event("", 1.0).send()).ok_or(Error::new("sent"))?;
-            assert_eq!((kind, why.as_str()), (Some("invalid"), "the label is empty"));
+            assert_eq!((kind, &*why), (TriggerErrorKind::Invalid.into(), "the label is empty"));
             let twice = refused(event("x", 1.0).with("k", 1.0).with("k", 2.0).send())
                 .ok_or(Error::new("sent"))?;
             assert_eq!(twice.1, "attribute `k` of `x`: the key is given twice");
@@ -28,7 +30,7 @@ fn triggers_are_checked_and_counted() {
         for _ in 0..16 {
             event("x", 1.0).send()?;
         }
-        assert_eq!(refused(event("x", 1.0).send()).map(|(kind, _)| kind), Some(Some("too-many")));
+        assert!(event("x", 1.0).send().unwrap_err().is(TriggerErrorKind::TooMany));
         Ok(())
     });
     assert_eq!(run.deliver("imu", 0, Message::new()).unwrap()[0].triggers.len(), 16);
@@ -73,9 +75,8 @@ fn lines_over_the_limit_are_dropped_and_counted_and_long_ones_are_truncated() {
 #[test]
 fn scratch_keeps_entries_by_name_within_its_size() {
     let mut run = on_event(imu("", "[limits]\nscratch = \"1 KiB\""), |sample| {
-        let kind = |error: Error| error.kind();
         if sample.identity().seq == 1 {
-            assert_eq!(scratch::get("a", 0, 1).map_err(kind).unwrap_err(), Some("no-such-entry"));
+            assert!(scratch::get("a", 0, 1).unwrap_err().is(ScratchErrorKind::NoSuchEntry));
             scratch::append("a", &[1, 2])?;
             scratch::append("a", &[3])?;
             return Err(Error::new("the entry survives this"));
@@ -83,17 +84,14 @@ fn scratch_keeps_entries_by_name_within_its_size() {
         assert_eq!(scratch::get("a", 1, 99)?, [2, 3]);
         assert_eq!(scratch::free(), 1024 - (64 + 1 + 3));
         let why = scratch::put("b", &[0; 900]).unwrap_err();
-        assert_eq!(kind(why.clone()), Some("no-room"));
+        assert!(why.is(ScratchErrorKind::NoRoom));
         assert!(
             why.to_string().contains("`b` needs 965 bytes of scratch and 956 are free"),
             "{why}"
         );
         // The size of a replaced entry is free again.
         scratch::put("a", &[0; 959])?;
-        assert_eq!(
-            scratch::put("bad\u{7}name", &[]).map_err(kind).unwrap_err(),
-            Some("wrong-name")
-        );
+        assert!(scratch::put("bad\u{7}name", &[]).unwrap_err().is(ScratchErrorKind::WrongName));
         assert_eq!(
             scratch::entries()
                 .iter()

@@ -37,12 +37,10 @@ pub struct DerivedEntry {
     key: DerivedKey,
 }
 
-/// Content of a [`DerivedEntry`].
 #[derive(Debug, PartialEq, Eq)]
 pub enum StoreLookup {
     /// The bytes as they were put.
     Content(Vec<u8>),
-    /// No file.
     Nothing,
     /// Damaged bytes, with the reason. They have to be replaced.
     Damaged(String),
@@ -115,7 +113,6 @@ impl DerivedEntry {
         Self { path: store.join(name), key }
     }
 
-    /// Returns the path of the file.
     pub fn path(&self) -> &Path {
         &self.path
     }

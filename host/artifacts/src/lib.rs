@@ -26,10 +26,8 @@ pub use derived::{DerivedEntry, DerivedKey, StoreLookup};
 pub use engine::BuiltEngine;
 pub use prune::STORE_BYTES;
 
-/// Kind of an entry.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum DerivedKind {
-    /// Native code of a component.
     NativeCode,
     /// Engine of TensorRT, built of a model.
     Engine,
@@ -38,7 +36,6 @@ pub enum DerivedKind {
 impl DerivedKind {
     const ALL: [DerivedKind; 2] = [DerivedKind::NativeCode, DerivedKind::Engine];
 
-    /// Returns the maximum size of an entry, in bytes.
     pub const fn max_bytes(self) -> usize {
         match self {
             DerivedKind::NativeCode => 256 << 20,
@@ -64,9 +61,7 @@ impl fmt::Display for DerivedKind {
     }
 }
 
-/// Errors of the store.
 #[derive(Debug, thiserror::Error)]
-#[allow(missing_docs)]
 pub enum StoreError {
     #[error("cannot write to the store of compiled files, `{}`", path.display())]
     Folder { path: PathBuf, source: io::Error },

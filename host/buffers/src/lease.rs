@@ -134,7 +134,6 @@ impl<M> Lease<M> {
         Self(Held::Shared { sample, position, meta })
     }
 
-    /// Returns the metadata of the sample.
     pub fn meta(&self) -> &M {
         match &self.0 {
             Held::Slot(hold) => &hold.seal().meta,

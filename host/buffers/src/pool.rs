@@ -201,7 +201,6 @@ impl<M> Pool<M> {
         Ok(unsafe { Draft::new(Arc::clone(&self.0), index, len) })
     }
 
-    /// Returns the number of slots.
     pub fn slots(&self) -> usize {
         self.0.slots.len()
     }

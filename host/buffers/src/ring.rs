@@ -74,7 +74,6 @@ impl<M> fmt::Display for ForeignDraft<M> {
 
 impl<M> Error for ForeignDraft<M> {}
 
-/// A ring over a pool.
 pub(crate) struct RingState<M> {
     id: u64,
     pool: Pool<M>,

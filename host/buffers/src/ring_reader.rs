@@ -193,7 +193,6 @@ impl<M> RingReader<M> {
         }
     }
 
-    /// Returns the counts of received and lost samples.
     pub fn counts(&self) -> RingCounts {
         match &self.0 {
             RingKind::Heap(ring) => ring.counts(),

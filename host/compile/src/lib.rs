@@ -50,9 +50,7 @@ impl Nans {
     }
 }
 
-/// Errors of compiling.
 #[derive(Debug, thiserror::Error)]
-#[allow(missing_docs)]
 pub enum CompileError {
     #[error("cannot read component `{}`", path.display())]
     Read { path: PathBuf, source: io::Error },

@@ -59,13 +59,11 @@ pub(super) type Instruction = (u16, u8, u8, u32);
 pub(super) enum To {
     /// Skips this many instructions.
     Over(u8),
-    /// The packet is dropped.
     Drop,
     /// The submessage has no length.
     Endless,
     /// The packet is truncated here.
     Cut,
-    /// The packet ends here.
     End,
     /// The code after the next island checks the same submessage.
     Behind,
@@ -129,7 +127,6 @@ impl Program {
         far
     }
 
-    /// Truncates the packet.
     pub(super) fn cut(&mut self) {
         self.island();
         self.put(TXA, 0);

@@ -38,7 +38,6 @@ const HELP: &str = "put the publisher's `.msg` files into the `msg` folder of th
 /// A type, and the hash of its layout if its writers announce one.
 type TypeKey = (String, Option<String>);
 
-/// Definitions by type and layout.
 #[derive(Debug)]
 pub(super) struct DefinitionsCache {
     sources: Sources,

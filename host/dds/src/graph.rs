@@ -20,7 +20,6 @@ const KEPT: usize = 256;
 /// Time that leaving the graph may take.
 const LEAVE: std::time::Duration = std::time::Duration::from_millis(100);
 
-/// Our node in the graph.
 pub(super) struct GraphNode {
     node: String,
     entry: OwnNode,

@@ -18,7 +18,6 @@ pub(super) const TYPE: &str = "rmw_dds_common::msg::dds_::ParticipantEntitiesInf
 /// The longest namespace or name of a node that is accepted.
 const LONGEST: usize = 1024;
 
-/// Our node, as it is listed in the graph.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(super) struct OwnNode {
     pub(super) participant: [u8; 16],

@@ -24,7 +24,6 @@ pub enum Distro {
     Newer,
 }
 
-/// Options for joining a domain.
 #[derive(Clone, Debug)]
 pub struct DdsOptions {
     /// The domain; `ROS_DOMAIN_ID`.
@@ -52,59 +51,29 @@ pub struct DdsOptions {
     pub time_of_day: fn() -> i64,
 }
 
-/// An error of DDS.
 #[derive(Debug, thiserror::Error)]
 pub enum DdsError {
-    /// The participant cannot be created.
     #[error("cannot join domain {domain}")]
-    Join {
-        /// The domain.
-        domain: u16,
-        /// The error of RustDDS.
-        source: Box<dyn Error + Send + Sync>,
-    },
-    /// An environment variable has an invalid value.
+    Join { domain: u16, source: Box<dyn Error + Send + Sync> },
     #[error("{variable} is `{value}`; {wanted}")]
     Setting {
-        /// The variable.
         variable: &'static str,
         /// Its value, made printable.
         value: String,
-        /// The valid values.
         wanted: &'static str,
     },
-    /// A name is not valid in ROS 2.
     #[error("`{name}` is not {what}")]
     Name {
         /// The name, made printable.
         name: String,
-        /// The expected kind of name.
         what: &'static str,
     },
-    /// No interface of this machine has an address.
     #[error("no network interface has the address {address}")]
-    Interface {
-        /// The address.
-        address: IpAddr,
-        /// The reason why no socket can use it.
-        source: io::Error,
-    },
-    /// The writer cannot be created.
+    Interface { address: IpAddr, source: io::Error },
     #[error("cannot write topic `{topic}`")]
-    Advertise {
-        /// The topic.
-        topic: String,
-        /// The error of RustDDS.
-        source: Box<dyn Error + Send + Sync>,
-    },
-    /// A message was not sent.
+    Advertise { topic: String, source: Box<dyn Error + Send + Sync> },
     #[error("a message of topic `{topic}` was not sent: {why}")]
-    Write {
-        /// The topic.
-        topic: String,
-        /// The reason.
-        why: String,
-    },
+    Write { topic: String, why: String },
 }
 
 impl DdsOptions {

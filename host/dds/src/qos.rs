@@ -31,7 +31,6 @@ pub(super) struct Offer {
     /// The DDS name.
     pub(super) type_name: String,
     pub(super) qos: QosPolicies,
-    /// The hash of its type, if it announces one.
     pub(super) type_hash: Option<String>,
 }
 

@@ -11,9 +11,7 @@ use super::state::panic_text;
 use gleaner_messages::Endian;
 use gleaner_transport::{Clock, Sink};
 
-/// A reader of any type.
 pub(super) type RawReader = no_key::SimpleDataReader<Raw, RawAdapter>;
-/// A writer of any type.
 pub(super) type RawWriter = no_key::DataWriter<Bytes, RawAdapter>;
 
 /// A sample at the time its bytes are copied.

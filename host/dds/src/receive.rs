@@ -50,7 +50,6 @@ const MAPPED_BLOCK: usize = 1 << 20;
 
 pub(super) enum ReceiverCommand {
     Subscribe(Box<TopicReader>),
-    /// Ends the subscription with this number.
     Unsubscribe(usize),
     Writer(GUID),
     WriterGone(GUID),

@@ -13,7 +13,6 @@ use super::type_query::QueryOutcome;
 use super::{Distro, names};
 use gleaner_transport::{Guid, ReceptionStatus};
 
-/// A count that is unknown.
 pub(super) const UNKNOWN: u64 = u64::MAX;
 
 #[derive(Debug, Default)]

@@ -83,7 +83,6 @@ pub(super) fn index(token: Token) -> Option<usize> {
 /// Times the memory of the samples that RustDDS keeps, with that of incomplete ones: those that
 /// their writer no longer has stay for 10 s.
 const WITH_INCOMPLETE: usize = 3;
-/// Most bytes of a datagram.
 const DATAGRAM_BYTES: usize = 64 << 10;
 
 /// Number of samples that RustDDS keeps for a topic.

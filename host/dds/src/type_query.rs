@@ -65,7 +65,6 @@ pub(super) struct Attempts {
 
 #[derive(Debug)]
 pub(super) enum QueryOutcome {
-    /// A node answered.
     Answer {
         node: String,
         /// The type's hash, as its writer announced it.
@@ -131,7 +130,6 @@ impl TypeQuerier {
         if self.is_open() { LARGEST } else { 0 }
     }
 
-    /// Continues the open query.
     pub(super) fn poll(
         &mut self,
         context: &ReceiveContext<'_>,

@@ -21,7 +21,6 @@ const DEPTH: std::ops::RangeInclusive<i32> = 1..=65_536;
 /// for the time until an acknowledgement, and not more than RustDDS allows for one reader.
 const UNACKNOWLEDGED: std::ops::RangeInclusive<i32> = 256..=8192;
 
-/// A writer of one topic.
 pub struct TopicWriter {
     topic: String,
     writer: RawWriter,
@@ -101,7 +100,6 @@ impl TopicWriter {
         sent.map_err(|error| DdsError::Write { topic: self.topic.clone(), why: why(error) })
     }
 
-    /// Returns the number of matched readers.
     pub fn readers(&self) -> usize {
         self.state.peers().connected(self.guid())
     }

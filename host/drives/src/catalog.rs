@@ -13,7 +13,6 @@ use gleaner_messages::type_description::type_hash;
 use gleaner_messages::{Definitions, Sources, SourcesError, short_name};
 use gleaner_transport::{DiscoveredTopic, TopicSpec, TransportError, latched_depth, same_type};
 
-/// Most layouts of one topic.
 const LAYOUTS_MAX: usize = 64;
 
 /// Most types that a warning names.
@@ -26,7 +25,6 @@ const OTHER_HASH: &str = "a channel states a type hash that is not that of its d
 
 #[derive(Copy, Clone)]
 pub(super) struct DriveChannel {
-    /// Index of its file.
     pub(super) file: usize,
     pub(super) id: u16,
     /// Number of the layout of its messages among those of its topic.

@@ -43,7 +43,6 @@ const HASH: &str = "type_description_hash";
 /// of rows.
 const ROW_BYTES: usize = 128;
 
-/// Location of a database.
 #[derive(Copy, Clone)]
 pub(super) struct DatabaseFile<'a> {
     shown: &'a Path,

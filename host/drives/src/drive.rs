@@ -300,7 +300,6 @@ impl Replay {
         &self.malformed
     }
 
-    /// Returns the progress of the replay.
     pub fn progress(&self) -> Progress {
         self.progress
     }

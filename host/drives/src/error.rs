@@ -10,191 +10,86 @@ use gleaner_base::Exit;
 /// Reasons why a drive cannot be opened, or ends early.
 #[derive(Debug, thiserror::Error)]
 pub enum ReplayError {
-    /// No file was given.
     #[error("a drive needs at least one file or rosbag2 directory")]
     NoFiles,
-    /// A file cannot be opened.
     #[error("cannot open drive `{path}`")]
-    Open {
-        /// The file.
-        path: PathBuf,
-        /// The error of the system.
-        source: io::Error,
-    },
-    /// A directory was given in place of a file.
+    Open { path: PathBuf, source: io::Error },
     #[error("`{path}` is a directory, not a file")]
-    Directory {
-        /// The directory.
-        path: PathBuf,
-    },
-    /// A directory is not one of rosbag2.
+    Directory { path: PathBuf },
     #[error("`{path}` has no metadata.yaml, and no .mcap or .db3 file")]
-    NoBag {
-        /// The directory.
-        path: PathBuf,
-    },
-    /// The metadata of a rosbag2 directory cannot be used.
+    NoBag { path: PathBuf },
     #[error("cannot use `{path}`")]
-    Metadata {
-        /// `metadata.yaml`.
-        path: PathBuf,
-        /// The cause.
-        source: Box<dyn Error + Send + Sync>,
-    },
-    /// The metadata of a rosbag2 directory name a file that does not exist.
+    Metadata { path: PathBuf, source: Box<dyn Error + Send + Sync> },
     #[error("`{metadata}` names `{file}`, which does not exist")]
-    NoSuchFile {
-        /// `metadata.yaml`.
-        metadata: PathBuf,
-        /// The file, as in the metadata.
-        file: String,
-    },
+    NoSuchFile { metadata: PathBuf, file: String },
     /// The metadata of a rosbag2 directory name a file outside of it, by its path or through a
     /// link.
     #[error("`{metadata}` names `{file}`, which is not in its directory")]
-    Outside {
-        /// `metadata.yaml`.
-        metadata: PathBuf,
-        /// The file, as in the metadata.
-        file: String,
-    },
-    /// Two of the given paths lead to the same file.
+    Outside { metadata: PathBuf, file: String },
     #[error("drive `{path}` is given twice")]
-    Twice {
-        /// The file.
-        path: PathBuf,
-    },
-    /// The file has no content.
+    Twice { path: PathBuf },
     #[error("`{path}` is empty: its recorder was ended before it wrote anything")]
-    Empty {
-        /// The file.
-        path: PathBuf,
-    },
-    /// The file has no known format.
+    Empty { path: PathBuf },
     #[error(
         "`{path}` is not an MCAP file, nor a rosbag2 database, nor one of them packed with zstd"
     )]
-    NotMcap {
-        /// The file.
-        path: PathBuf,
-    },
-    /// A packed file cannot be unpacked.
+    NotMcap { path: PathBuf },
     #[error("cannot unpack drive `{path}` into `{folder}`")]
-    Unpack {
-        /// The file.
-        path: PathBuf,
-        /// The folder for its content.
-        folder: PathBuf,
-        /// The cause.
-        source: io::Error,
-    },
-    /// The packed files of a drive exceed the limit.
+    Unpack { path: PathBuf, folder: PathBuf, source: io::Error },
     #[error("with drive `{path}`, the packed files hold more than {allowed} bytes")]
     UnpacksTooLarge {
-        /// The file.
         path: PathBuf,
         /// [`super::DriveLimits::unpacked_bytes`].
         allowed: u64,
     },
-    /// The content of a packed file is far too large for its size.
     #[error(
         "drive `{path}` unpacks to more than {allowed} bytes, \
          far more than a recording of its size"
     )]
-    UnpacksManyTimes {
-        /// The file.
-        path: PathBuf,
-        /// The limit for its size.
-        allowed: u64,
-    },
-    /// The content of a packed file exceeds the free disk space.
+    UnpacksManyTimes { path: PathBuf, allowed: u64 },
     #[error(
         "drive `{path}` unpacks to more than {allowed} bytes, \
          nine tenths of the free space in `{folder}`"
     )]
-    NoRoom {
-        /// The file.
-        path: PathBuf,
-        /// The folder for its content.
-        folder: PathBuf,
-        /// The limit for the disk.
-        allowed: u64,
-    },
-    /// A database cannot be read at all.
+    NoRoom { path: PathBuf, folder: PathBuf, allowed: u64 },
     #[error("cannot use database `{path}`")]
     Database {
-        /// The file.
         path: PathBuf,
         /// The error of SQLite, or what is missing in the database.
         source: Box<dyn Error + Send + Sync>,
     },
-    /// The newest messages of a database are still in its journal.
     #[error("database `{path}` was not closed: its newest messages are in `{beside}`")]
-    NotClosed {
-        /// The file.
-        path: PathBuf,
-        /// Journal of the database.
-        beside: PathBuf,
-    },
+    NotClosed { path: PathBuf, beside: PathBuf },
     /// A database has no index of message times. Without one, each search for the next message
     /// would read the whole database.
     #[error("database `{path}` has no index of message times")]
-    NoTimes {
-        /// The file.
-        path: PathBuf,
-    },
-    /// This program was built without the reader of rosbag2 directories.
+    NoTimes { path: PathBuf },
     #[error("`{path}` is {what}, which this program does not read")]
-    NotBuiltIn {
-        /// The file or directory.
-        path: PathBuf,
-        /// Kind of the file or directory.
-        what: &'static str,
-    },
-    /// Two recordings have the same topic at the same time.
+    NotBuiltIn { path: PathBuf, what: &'static str },
     #[error("`{first}` and `{second}` overlap in time, and both have topic `{topic}`")]
     Overlap {
         /// The topic, or the first of several.
         topic: String,
-        /// One file.
         first: PathBuf,
-        /// The other file.
         second: PathBuf,
     },
-    /// The files are several drives.
     #[error("these are {} separate drives: {}", drives.len(), list(drives))]
-    Separate {
-        /// The files and directories of each drive.
-        drives: Vec<Vec<PathBuf>>,
-    },
+    Separate { drives: Vec<Vec<PathBuf>> },
     /// The system failed to read the file; the file itself may be intact.
     #[error("cannot read drive `{path}` at byte {offset}")]
-    Read {
-        /// The file.
-        path: PathBuf,
-        /// The position.
-        offset: u64,
-        /// The error of the system.
-        source: io::Error,
-    },
+    Read { path: PathBuf, offset: u64, source: io::Error },
     /// The file is damaged. All messages that [`super::Replay`] promises were delivered before.
     #[error("drive `{path}` is damaged at {at}")]
     Damaged {
-        /// The file.
         path: PathBuf,
-        /// The position.
         at: DamageLocation,
-        /// The damage.
         #[source]
         what: Damage,
     },
     /// The drive cannot be read before the part to replay. That part was replayed in full, without
     /// latched samples from before it.
     #[error("latched samples from before the replayed part are missing")]
-    WithoutLatched {
-        /// The error before that part.
-        source: Box<ReplayError>,
-    },
+    WithoutLatched { source: Box<ReplayError> },
 }
 
 impl ReplayError {

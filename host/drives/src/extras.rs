@@ -42,7 +42,6 @@ pub struct Attachment {
     pub name: String,
     /// Media type of the data, for example `image/jpeg`; empty if unknown.
     pub media_type: String,
-    /// Content of the attachment.
     pub data: Vec<u8>,
 }
 

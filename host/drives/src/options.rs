@@ -6,10 +6,8 @@ use std::path::PathBuf;
 use super::unpack::Unpacked;
 use gleaner_messages::Sources;
 
-/// Options of opening a drive.
 #[derive(Clone, Debug, Default)]
 pub struct DriveOptions {
-    /// Limits of memory and disk.
     pub limits: DriveLimits,
     /// Sources of message definitions that the files do not carry; `None` for no search.
     pub sources: Option<Sources>,
@@ -25,7 +23,6 @@ pub struct DriveOptions {
     pub unpacked: Vec<Unpacked>,
 }
 
-/// Limits of memory and disk of a replay.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct DriveLimits {
     /// Largest chunk, in bytes before or after decompression, and largest message of a database; a

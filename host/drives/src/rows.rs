@@ -61,9 +61,7 @@ pub(super) struct MessageRows {
 enum PieceEnd {
     /// There are more messages, from this time on.
     Piece(u64),
-    /// The span to replay has ended.
     Span,
-    /// The table has ended.
     Table,
 }
 

@@ -7,18 +7,14 @@ use gleaner_transport::{Delivery, SampleMeta, Subscription};
 pub struct ReplayStep {
     /// Log time of the message, in ns.
     pub at_ns: i64,
-    /// The subscription it was delivered to.
     pub subscription: Subscription,
-    /// Result of the delivery.
     pub delivery: Delivery,
-    /// Metadata passed to the sink.
     pub meta: SampleMeta,
     /// Length of the CDR payload, without encapsulation; of a packed message that is too big, the
     /// part that was unpacked.
     pub bytes: usize,
 }
 
-/// Progress of a replay.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Default)]
 pub struct Progress {
     /// Number of deliveries made.

@@ -20,7 +20,6 @@ use gleaner_transport::{Guid, SampleMeta, Subscription};
 /// Bytes before the CDR of a message.
 const ENCAPSULATION: usize = 4;
 
-/// The store of a file's messages.
 pub(super) enum Store {
     /// Segments, found when the file was opened.
     Mcap(SourceFile),
@@ -51,7 +50,6 @@ pub(super) struct Track {
     store: Store,
     contents: Contents,
     times: Option<(u64, u64)>,
-    /// Number of the recording that it belongs to.
     recording: usize,
     span: Span,
     /// By channel id. Most files have a few channels with small ids, so a table beats a map.

@@ -36,7 +36,6 @@ const PREFIX: &str = ".unpacked-";
 /// Age since the last write from which a file of such a name belongs to a killed process.
 const STALE: Duration = Duration::from_secs(3600);
 
-/// The content of a packed file.
 #[derive(Clone, Debug)]
 pub struct Unpacked {
     /// The packed file, named as in the drive.
@@ -47,7 +46,6 @@ pub struct Unpacked {
     name: Option<ContentName>,
 }
 
-/// A name of the content of a packed file.
 #[derive(Clone, Debug)]
 pub enum ContentName {
     /// Removed with the last clone.
@@ -71,7 +69,6 @@ enum SizeLimit {
     Drive(u64),
     /// The limit for its own size.
     Ratio(u64),
-    /// The limit of the disk space.
     Disk(u64),
 }
 

@@ -8,48 +8,26 @@ use gleaner_base::{Exit, Explain};
 use gleaner_protocol::ingress::RefusedTopic;
 use gleaner_protocol::link::LinkError;
 
-/// An error of the connection to the ingress.
 #[derive(Debug, thiserror::Error)]
 pub enum FeedError {
     /// The ingress has ended, or closed the connection. Held samples stay valid.
     #[error("the ingress has ended, or closed the connection")]
     Gone,
-    /// An awaited message did not arrive in time.
     #[error("the ingress has not sent {awaited} for {seconds} s")]
     Silent {
         /// The message, such as "topic 3".
         awaited: String,
-        /// The timeout.
         seconds: u64,
     },
-    /// A granted topic cannot be read.
     #[error("{}", text(reason))]
-    Refused {
-        /// Its id, from the grant.
-        id: u32,
-        /// The reason.
-        reason: RefusedTopic,
-        /// The causes of the reason.
-        source: Option<RefusalCause>,
-    },
+    Refused { id: u32, reason: RefusedTopic, source: Option<RefusalCause> },
     /// A message contradicts an earlier one, or does not match its descriptor.
     #[error("a message of the ingress is invalid: {reason}")]
-    Malformed {
-        /// The reason.
-        reason: String,
-    },
-    /// The control page cannot be mapped.
+    Malformed { reason: String },
     #[error("cannot map the control page")]
-    Control {
-        /// The error of the system.
-        source: io::Error,
-    },
-    /// The socket failed, or a frame is invalid.
+    Control { source: io::Error },
     #[error("cannot communicate with the ingress")]
-    Socket {
-        /// The cause.
-        source: LinkError,
-    },
+    Socket { source: LinkError },
 }
 
 #[derive(Debug)]

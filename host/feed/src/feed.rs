@@ -28,7 +28,6 @@ const WAIT_STEP: Duration = Duration::from_millis(100);
 /// Messages that one call reads at most: the rest follows in the next call.
 const MESSAGES_MAX: usize = 4096;
 
-/// An event of the connection.
 #[derive(Debug)]
 pub enum FeedEvent {
     /// A granted topic can be read.
@@ -37,19 +36,16 @@ pub enum FeedEvent {
     Refused {
         /// Its id, from the grant.
         id: u32,
-        /// The reason.
         reason: RefusedTopic,
     },
     /// The answer to [`Feed::request_definitions`].
     Definitions {
-        /// Id of the topic.
         id: u32,
         /// ros2msg text of its type and of all types it refers to; `None` if there is none.
         text: Option<String>,
     },
     /// The answer to [`Feed::request_layout`].
     Layout {
-        /// Id of the topic.
         id: u32,
         /// Hash (RIHS01) of the layout that is received; `None` if no writer has announced one.
         type_hash: Option<String>,
@@ -81,7 +77,6 @@ pub struct Feed {
     attached: Vec<(u32, TopicMemory)>,
     /// Events that no call has returned yet.
     events: VecDeque<FeedEvent>,
-    /// The error that ended the connection.
     end: Option<FeedError>,
 }
 

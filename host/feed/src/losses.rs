@@ -75,7 +75,6 @@ impl TopicLosses {
     }
 }
 
-/// A time without reception of a topic.
 struct ReceptionGap {
     /// Writers whose first sample after it was not found yet, with their last number before it.
     awaited: Vec<(Guid, u64)>,

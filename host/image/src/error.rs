@@ -22,103 +22,41 @@ pub enum ImageError {
         /// The reason and the way out.
         why: String,
     },
-    /// Bytes that are not an image file.
     #[error("data is neither JPEG nor PNG: its {len} bytes start with {start:02x?}")]
-    NotAnImage {
-        /// Number of bytes.
-        len: usize,
-        /// The first eight of them.
-        start: Vec<u8>,
-    },
+    NotAnImage { len: usize, start: Vec<u8> },
     /// A small file of a huge image.
     #[error("{}", refused::too_many_pixels((*width, *height), *needed, *allowed as u64))]
     Bomb {
-        /// Pixels per row.
         width: u32,
-        /// Rows.
         height: u32,
         /// Bytes as rgb8.
         needed: u64,
         /// Bytes that the input may have.
         allowed: usize,
     },
-    /// A file whose decoder would need far more memory than its pixels.
     #[error(
         "{format} of {width}x{height} needs {} to decode, besides its pixels; {} is allowed",
         RoundedBytes::up(*needed),
         RoundedBytes::down(*allowed as u64)
     )]
-    WorkingMemory {
-        /// Format of the file.
-        format: Format,
-        /// Pixels per row.
-        width: u32,
-        /// Rows.
-        height: u32,
-        /// Bytes that the decoder would allocate.
-        needed: u64,
-        /// Bytes allowed.
-        allowed: usize,
-    },
-    /// The header does not match the bytes.
+    WorkingMemory { format: Format, width: u32, height: u32, needed: u64, allowed: usize },
     #[error("{found} where a {expected} was expected")]
-    OtherImage {
-        /// The header that the caller passed.
-        expected: ImageHeader,
-        /// The header of the bytes.
-        found: ImageHeader,
-    },
-    /// The file is truncated.
+    OtherImage { expected: ImageHeader, found: ImageHeader },
     #[error("{format} is truncated: its {len} bytes end before the image does")]
-    Truncated {
-        /// Format of the file.
-        format: Format,
-        /// Number of bytes.
-        len: usize,
-    },
-    /// A kind of file that is not decoded.
+    Truncated { format: Format, len: usize },
     #[error("{format} is {what}, which is not supported: publish baseline JPEG, or PNG of 8 bits")]
-    Unsupported {
-        /// Format of the file.
-        format: Format,
-        /// The kind.
-        what: &'static str,
-    },
-    /// A file that violates its format.
+    Unsupported { format: Format, what: &'static str },
     #[error("{format} is damaged at byte {at}: {what}")]
-    Damaged {
-        /// Format of the file.
-        format: Format,
-        /// Offset of the damage.
-        at: usize,
-        /// The violation.
-        what: &'static str,
-    },
-    /// A resize whose result would have 8 of the 16 bits.
+    Damaged { format: Format, at: usize, what: &'static str },
     #[error(
         "resize of mono16 would keep 8 of its 16 bits: call `to_gray` first, or read its pixels"
     )]
     ResizeOfMono16,
     /// The JPEG decoder failed. Its cause is in the text: a lambda's author sees one line.
     #[error("cannot decode the JPEG of {width}x{height}: {cause}")]
-    Jpeg {
-        /// Pixels per row.
-        width: u32,
-        /// Rows.
-        height: u32,
-        /// The cause.
-        cause: zune_jpeg::errors::DecodeErrors,
-    },
-    /// The PNG decoder failed.
+    Jpeg { width: u32, height: u32, cause: zune_jpeg::errors::DecodeErrors },
     #[error("cannot decode the PNG of {width}x{height}: {cause}")]
-    Png {
-        /// Pixels per row.
-        width: u32,
-        /// Rows.
-        height: u32,
-        /// The cause.
-        cause: png::DecodingError,
-    },
+    Png { width: u32, height: u32, cause: png::DecodingError },
 }
 
 impl ImageError {

@@ -101,7 +101,6 @@ impl ConnectedLambda {
         self.models.get(model)
     }
 
-    /// Returns whether it may use a session.
     pub(crate) fn uses(&self, key: &SessionKey) -> bool {
         self.models.values().any(|granted| granted.key == *key && granted.refused.is_none())
     }

@@ -6,16 +6,13 @@ use crate::running::ModelWork;
 
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum EngineError {
-    /// A model takes too long and cannot be interrupted.
     #[error(
         "model `{}` of lambda {} has run for more than {} s", .0.path, quoted(&.0.lambdas),
         .0.limit.as_secs_f64()
     )]
     Overdue(ModelWork),
-    /// A thread has ended.
     #[error("a thread of this process has ended")]
     Thread,
-    /// The system has no memory.
     #[error("cannot wait for lambdas")]
     Wait(#[source] io::Error),
 }

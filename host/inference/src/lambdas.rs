@@ -95,7 +95,6 @@ impl LambdaTable {
         users.map(|lambda| lambda.name.clone()).collect()
     }
 
-    /// Returns whether a lambda may use a session.
     pub(crate) fn use_session(&self, key: &SessionKey) -> bool {
         self.lambdas.values().any(|lambda| lambda.uses(key))
     }

@@ -69,13 +69,10 @@ pub(crate) struct LoadDone {
 pub(crate) struct LoadLimits {
     /// Largest size of a file, in bytes.
     pub(crate) model_max: u64,
-    /// Time to load a model.
     pub(crate) load_max: Duration,
-    /// Time to run it once.
     pub(crate) run_max: Duration,
 }
 
-/// The work of the thread.
 pub(crate) struct ModelLoader {
     pub(crate) backends: Backends,
     pub(crate) limits: LoadLimits,

@@ -7,9 +7,7 @@ use gleaner_protocol::inference::{
 /// A checked input, to copy out of the region.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct PlacedInput {
-    /// Type of its elements.
     pub element: Element,
-    /// Length of each dimension.
     pub shape: Vec<u32>,
     /// Offset of its first byte in the region.
     pub offset: u64,
@@ -19,7 +17,6 @@ pub struct PlacedInput {
 
 /// The reason why a request does not fit its model.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[allow(missing_docs)]
 pub enum PlaceError {
     #[error("the model has no input `{name}`; its inputs are {known}")]
     Unknown { name: String, known: String },
@@ -100,7 +97,6 @@ fn check_input(
     Ok(PlacedInput { element: *element, shape: shape.clone(), offset, bytes })
 }
 
-/// Outputs that are too large to be sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("the outputs have more than {MAX_TENSOR_BYTES} bytes")]
 pub struct OutputsTooLarge;

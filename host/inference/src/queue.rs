@@ -36,7 +36,6 @@ impl<O: Copy + Eq + Hash, T> FairQueue<O, T> {
         self.waiting.push(QueuedEntry { owner, deadline, overtaken_by: HashSet::new(), entry });
     }
 
-    /// Removes the entry of an owner.
     pub fn remove(&mut self, owner: O) -> Option<T> {
         let index = self.waiting.iter().position(|waiting| waiting.owner == owner)?;
         Some(self.waiting.remove(index).entry)

@@ -11,7 +11,6 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use rustix::fs::{MemfdFlags, SealFlags, fcntl_add_seals, memfd_create};
 
-/// Smallest size of a region.
 const MIN_BYTES: u64 = 4096;
 
 /// A region of fixed size.

@@ -43,7 +43,6 @@ struct RunAllowance {
     pace: RunPace,
 }
 
-/// A run that waits for others.
 #[derive(Debug)]
 pub(crate) struct WaitingRun {
     /// Identity of the lambda.
@@ -91,7 +90,6 @@ impl RunSchedule {
         self.queue.push(lambda, deadline, run);
     }
 
-    /// Removes the waiting run of a lambda.
     pub(crate) fn remove(&mut self, lambda: LambdaId) {
         self.queue.remove(lambda);
     }

@@ -23,11 +23,9 @@ pub(crate) use gleaner_protocol::inference::TryLoad as SessionKey;
 pub(crate) enum LoadState {
     Loading,
     Ready(ReadyModel),
-    /// It cannot be loaded, for this reason.
     Failed(String),
 }
 
-/// Description of a loaded model.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct ReadyModel {
     pub(crate) inputs: Vec<TensorInfo>,

@@ -38,7 +38,6 @@ pub(crate) struct WorkerModel {
 #[derive(Default)]
 pub(crate) struct LastRun {
     inputs: Vec<TensorValue>,
-    /// The result, if it was completed.
     result: Option<LastResult>,
 }
 
@@ -73,7 +72,6 @@ pub(crate) struct RunDone {
     pub(crate) ran_ns: Option<u64>,
 }
 
-/// Outputs in a region.
 pub(crate) struct RunOutputs {
     pub(crate) places: Vec<TensorPlace>,
     pub(crate) region: Arc<TensorRegion>,
@@ -81,7 +79,6 @@ pub(crate) struct RunOutputs {
     pub(crate) run_ns: u64,
 }
 
-/// The work of the thread.
 pub(crate) struct ModelWorker {
     note: WorkNote,
     run_max: Duration,

@@ -56,7 +56,6 @@ enum LoopEnd {
 }
 
 impl Ingress {
-    /// Creates an ingress without readers.
     pub fn new(source: Box<dyn LiveSource>, reports: Reports) -> Self {
         let now = Instant::now();
         Self {
@@ -453,7 +452,6 @@ impl Ingress {
         self.topics.update_status(&*self.source);
     }
 
-    /// Reports the status to the readers and the starter.
     fn report_status(&mut self, now: Instant) {
         let mut health = self.health.clone();
         if self.source.knows_all_topics() {
@@ -492,6 +490,5 @@ impl Ingress {
 struct Ready {
     control: bool,
     stop: bool,
-    /// The events of each reader.
     readers: Vec<PollFlags>,
 }

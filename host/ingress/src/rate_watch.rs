@@ -13,7 +13,6 @@ const LEAST_HZ: f64 = 5.0;
 const PATIENCE: u32 = 3;
 const ADOPTED: u32 = 60;
 
-/// The rate of one topic.
 #[derive(Debug, Default)]
 pub(crate) struct RateWatch {
     /// Connected writers, received samples and time of the last measurement.

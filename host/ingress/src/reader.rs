@@ -26,7 +26,6 @@ const STALLED: Duration = Duration::from_secs(30);
 
 /// A topic of a reader.
 pub(crate) struct Attachment {
-    /// Id of the grant.
     pub(crate) id: u32,
     /// Key in the table of topics.
     pub(crate) topic: u64,
@@ -56,7 +55,6 @@ pub(crate) struct DefinitionsWait {
     pub(crate) until: Instant,
 }
 
-/// A topic that a reader may publish.
 struct PublishedTopic {
     /// `None` if the source refused it.
     publisher: Option<Box<dyn Publisher>>,

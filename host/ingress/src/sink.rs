@@ -18,7 +18,6 @@ use crate::sizes::RegionSizes;
 /// Number of samples that were too big for all regions, and are remembered.
 const REFUSED: usize = 64;
 
-/// Numbers of a topic, for its status.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(crate) struct ReceivedCounts {
     pub(crate) received: u64,
@@ -48,7 +47,6 @@ struct RegionReader {
     digests: bool,
 }
 
-/// A reader of a region, as it begins.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct AttachedReader {
     pub(crate) region: RegionId,
@@ -189,7 +187,6 @@ struct SinkState {
     counts: ReceivedCounts,
     /// The subscription of the last copy, until its sample is accepted.
     copied: Option<u64>,
-    /// The samples received so far.
     seen: Gaps,
     /// Set once there was a second subscription: a sample may come over both.
     checks_doubles: bool,

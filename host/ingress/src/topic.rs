@@ -21,7 +21,6 @@ use crate::sizes::RegionSizes;
 /// second may find some writers later than others.
 const OVERLAP: Duration = Duration::from_secs(3);
 
-/// Most warnings in the status of a topic.
 const MOST_WARNINGS: usize = 16;
 
 /// A topic with one subscription, or with two while one takes over from the other.
@@ -218,7 +217,6 @@ impl SharedTopic {
         self.regions.iter().find(|(known, ..)| *known == region).map(|(_, file, _)| file)
     }
 
-    /// Ends all subscriptions.
     pub(crate) fn unsubscribe(self, source: &mut dyn LiveSource) {
         let previous = self.previous.map(|previous| previous.subscription);
         for subscription in [previous, self.subscription].into_iter().flatten() {

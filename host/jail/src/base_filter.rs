@@ -12,7 +12,6 @@ use crate::JailError;
 use crate::filter::{DeniedCalls, install};
 use crate::priority::leave_real_time;
 
-/// The name of this layer.
 pub const NAME: &str = "system calls";
 /// The name of the layer of a process that has to keep the priority of its starter.
 const REAL_TIME: &str = "real-time priority";

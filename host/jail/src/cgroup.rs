@@ -14,7 +14,6 @@ use gleaner_protocol::Layer;
 
 use crate::cgroup_join;
 
-/// The name of this layer.
 pub const NAME: &str = "control group";
 
 /// The environment variable with the folder of a runtime's group, for [`limit_memory`].
@@ -28,7 +27,6 @@ const CPU_MAX: &str = "cpu.max";
 /// them would take the time of other lambdas.
 const ONE_CORE: &str = "100000 100000";
 
-/// Limits of a group.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct CgroupLimits {
     /// Bytes of memory, page cache included, if bounded from the start.

@@ -13,7 +13,6 @@ use landlock::{
 
 use crate::{JailError, needed};
 
-/// The name of this layer.
 pub const NAME: &str = "files";
 /// The name of the layer that restricts changes only.
 pub const WRITTEN: &str = "changes of files";

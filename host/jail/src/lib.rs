@@ -41,7 +41,6 @@ pub use files::Paths;
 
 /// Reasons why a layer is missing although the system has it.
 #[derive(Debug, thiserror::Error)]
-#[allow(missing_docs)]
 pub enum JailError {
     #[error("cannot build the seccomp filter")]
     Build(#[source] seccompiler::BackendError),

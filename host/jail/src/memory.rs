@@ -8,7 +8,6 @@ use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 
 use crate::JailError;
 
-/// The name of this layer.
 pub const NAME: &str = "memory";
 
 /// Stack limit of the main thread.

@@ -3,7 +3,6 @@
 use gleaner_protocol::Layer;
 use rustix::process::{DumpableBehavior, set_dumpable_behavior};
 
-/// The name of this layer.
 pub const NAME: &str = "own memory";
 
 /// Denies other processes of this user access to `/proc/PID/mem`, `/proc/PID/fd` and similar files

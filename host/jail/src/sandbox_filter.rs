@@ -259,7 +259,6 @@ fn install_before(only_counted_memory: bool) -> Result<(), JailError> {
     install(&refused.filter(libc::EPERM)?)
 }
 
-/// Denies new processes and other programs.
 pub(crate) fn no_processes(refused: DeniedCalls) -> DeniedCalls {
     no_new_processes(refused.calls(NEW_PROGRAMS))
 }

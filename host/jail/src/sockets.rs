@@ -12,9 +12,7 @@ pub const INTERNET_ONLY: &str = "local sockets";
 /// The name of the layer of a process that creates UDP sockets only.
 pub const UDP_ONLY: &str = "stream sockets";
 
-/// Calls that accept connections.
 const ACCEPTING: &[i64] = &[libc::SYS_listen, libc::SYS_accept, libc::SYS_accept4];
-/// Calls that create or connect sockets.
 const CREATING: &[i64] = &[libc::SYS_socket, libc::SYS_bind, libc::SYS_connect];
 /// Calls that send files, and the kernel counts those in flight for all processes of a user.
 const SENDING_FILES: &[i64] = &[libc::SYS_sendmsg, libc::SYS_sendmmsg];
@@ -72,7 +70,6 @@ pub(crate) fn internet_only(refused: DeniedCalls) -> DeniedCalls {
     refused
 }
 
-/// Denies, of these sockets, all but UDP.
 pub(crate) fn udp_only(refused: DeniedCalls) -> DeniedCalls {
     let refused = internet_only(refused);
     OTHER_TYPES

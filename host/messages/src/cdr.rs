@@ -3,7 +3,6 @@
 //! The bytes are a payload without its four bytes of encapsulation; alignment counts from the first
 //! byte and is at most 8. Source: OMG CORBA 3.0, section 15.3, called XCDR1 by DDS-XTypes.
 
-/// Byte order of a CDR payload.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Hash, Default)]
 pub enum Endian {
     /// Least significant byte first, as on nearly every vehicle.
@@ -16,42 +15,14 @@ pub enum Endian {
 /// Reasons why a field cannot be read from the bytes.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum CdrError {
-    /// The message ends inside a value.
     #[error("message too short: {needed} bytes needed at offset {offset}, it has {have} there")]
-    Short {
-        /// Start of the value.
-        offset: usize,
-        /// Size of the value.
-        needed: usize,
-        /// Bytes from `offset` to the end.
-        have: usize,
-    },
-    /// A sequence claims more elements than the rest of the message could hold.
+    Short { offset: usize, needed: usize, have: usize },
     #[error("sequence at offset {offset} claims {count} elements, only {have} bytes follow")]
-    Count {
-        /// Offset of the sequence's count.
-        offset: usize,
-        /// The claimed count.
-        count: usize,
-        /// Bytes that follow the count.
-        have: usize,
-    },
-    /// The path names an element that this message does not have.
+    Count { offset: usize, count: usize, have: usize },
     #[error("element {index} requested, the sequence at offset {offset} has {count}")]
-    Index {
-        /// Offset of the sequence's count.
-        offset: usize,
-        /// The requested element.
-        index: usize,
-        /// Number of elements.
-        count: usize,
-    },
-    /// A string is not UTF-8.
+    Index { offset: usize, index: usize, count: usize },
     #[error("string at offset {offset} is not UTF-8")]
-    NotUtf8 {
-        /// Offset of the characters.
-        offset: usize,
-    },
+    NotUtf8 { offset: usize },
     /// [`super::FieldPath::number`] was called on a path whose kind is not a number.
     #[error("the field is not a number")]
     NotANumber,

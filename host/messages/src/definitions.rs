@@ -34,61 +34,28 @@ pub(super) struct Struct {
     weight: usize,
 }
 
-/// Reasons why a definition text is invalid.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum MessageError {
-    /// A line is not ros2msg.
     #[error("line {line}: expected {wanted}, found `{text}`")]
     Syntax {
         /// Line number, from 1.
         line: usize,
         /// The line, truncated to 80 characters.
         text: String,
-        /// The expected form.
         wanted: &'static str,
     },
-    /// A field has a type whose definition is not in the text.
     #[error("field `{field}` of type `{type_name}` has type `{missing}`, which is not defined")]
-    Undefined {
-        /// The type with the field.
-        type_name: String,
-        /// The field.
-        field: String,
-        /// The missing type.
-        missing: String,
-    },
-    /// Two parts define the same type differently.
+    Undefined { type_name: String, field: String, missing: String },
     #[error("type `{type_name}` is defined twice, differently")]
-    Conflict {
-        /// The type.
-        type_name: String,
-    },
-    /// A type has two fields with the same name.
+    Conflict { type_name: String },
     #[error("type `{type_name}` has two fields `{field}`")]
-    DuplicateField {
-        /// The type.
-        type_name: String,
-        /// The field.
-        field: String,
-    },
-    /// A type contains itself, so that its size is infinite.
+    DuplicateField { type_name: String, field: String },
     #[error("type `{type_name}` contains itself")]
-    Recursive {
-        /// The type.
-        type_name: String,
-    },
-    /// Types nest deeper than any sensible message.
+    Recursive { type_name: String },
     #[error("type `{type_name}` nests deeper than {MAX_DEPTH} levels")]
-    TooDeep {
-        /// The type at which the limit was reached.
-        type_name: String,
-    },
-    /// A type is larger than any sensible message.
+    TooDeep { type_name: String },
     #[error("type `{type_name}` has more than {MAX_FIELDS} fields or 4 GiB")]
-    TooLarge {
-        /// The type.
-        type_name: String,
-    },
+    TooLarge { type_name: String },
 }
 
 impl Definitions {

@@ -6,27 +6,22 @@
 pub struct CdrWriter(Vec<u8>);
 
 impl CdrWriter {
-    /// Creates an empty message.
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// Adds a `uint8`.
     pub fn u8(&mut self, value: u8) -> &mut Self {
         self.aligned(&[value])
     }
 
-    /// Adds an `int32`.
     pub fn i32(&mut self, value: i32) -> &mut Self {
         self.aligned(&value.to_le_bytes())
     }
 
-    /// Adds a `uint32`.
     pub fn u32(&mut self, value: u32) -> &mut Self {
         self.aligned(&value.to_le_bytes())
     }
 
-    /// Adds a `uint64`.
     pub fn u64(&mut self, value: u64) -> &mut Self {
         self.aligned(&value.to_le_bytes())
     }
@@ -51,7 +46,6 @@ impl CdrWriter {
         self.i32(seconds as i32).u32(ns.rem_euclid(1_000_000_000) as u32)
     }
 
-    /// Returns the message so far.
     pub fn bytes(&self) -> &[u8] {
         &self.0
     }

@@ -27,79 +27,41 @@ pub enum PathError {
     /// The path is not of the form `a.b[3].c`.
     #[error(transparent)]
     Syntax(#[from] MalformedPath),
-    /// A type has no field of this name.
     #[error(
         "type `{type_name}` has no field `{field}`{}; it has: {}",
         hint(nearest),
         fields.join(", ")
     )]
     NoSuchField {
-        /// The type.
         type_name: String,
-        /// The requested field.
         field: String,
         /// The fields of the type, in wire order.
         fields: Vec<String>,
         /// The most similar name, if one is similar.
         nearest: Option<String>,
     },
-    /// The path ends at a message instead of a value.
     #[error("`{path}` is a whole `{type_name}`; name one of its fields: {}", fields.join(", "))]
-    WholeStruct {
-        /// The path.
-        path: String,
-        /// The type it leads to.
-        type_name: String,
-        /// That type's fields.
-        fields: Vec<String>,
-    },
-    /// The path passes through an array without an index.
+    WholeStruct { path: String, type_name: String, fields: Vec<String> },
     #[error("field `{field}` of `{path}` is an array; write `{field}[0]` and so on")]
-    NeedsIndex {
-        /// The path.
-        path: String,
-        /// The array.
-        field: String,
-    },
+    NeedsIndex { path: String, field: String },
     /// The path continues after a value, or indexes a field that is not an array.
     #[error("field `{field}` of `{path}` is a single value with nothing inside")]
-    NothingInside {
-        /// The path.
-        path: String,
-        /// The value.
-        field: String,
-    },
-    /// The index is beyond an array of fixed length.
+    NothingInside { path: String, field: String },
     #[error("field `{field}` of `{path}` has {len} elements, counted from 0")]
-    OutOfRange {
-        /// The path.
-        path: String,
-        /// The array.
-        field: String,
-        /// Its length.
-        len: usize,
-    },
+    OutOfRange { path: String, field: String, len: usize },
     /// A `wstring` is in the way. ROS 2's implementations disagree on the width of its characters,
     /// so neither it nor the fields after it can be located reliably.
     #[error(
         "`{path}` is or lies behind the wstring `{field}`, whose size on the wire is not defined"
     )]
-    WideText {
-        /// The path.
-        path: String,
-        /// The wstring.
-        field: String,
-    },
-    /// The topic has several layouts of its type, in which the path means different things.
+    WideText { path: String, field: String },
     #[error(
         "`{path}` does not mean the same in all layouts of `{type_name}` on this topic: in that \
          with the fields {}, {}; in that with the fields {}, {}",
         first.0, first.1, second.0, second.1
     )]
     Layouts {
-        /// The path.
         path: String,
-        /// The type.
         type_name: String,
         /// Fields of one layout, and the meaning of the path in it.
         first: Box<(String, String)>,
@@ -170,7 +132,6 @@ impl FieldPath {
             || self.others.iter().any(Self::walks)
     }
 
-    /// Returns the path as written.
     pub fn path(&self) -> &str {
         &self.path
     }
@@ -180,7 +141,6 @@ impl FieldPath {
         &self.type_name
     }
 
-    /// Returns the kind of value that [`FieldPath::read`] returns.
     pub fn kind(&self) -> ValueKind {
         self.leaf.kind()
     }
@@ -318,7 +278,6 @@ impl Compiler<'_> {
         Ok(())
     }
 
-    /// Emits the steps over a whole field.
     fn skip(&mut self, field: &FieldDefinition<usize>) -> Result<(), PathError> {
         let least = self.least(field);
         match (field.count, self.layout(field)) {

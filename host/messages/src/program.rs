@@ -9,19 +9,30 @@ use super::value::{MessageValue, ValueKind};
 pub(super) enum Op {
     /// Any run of fixed-size fields.
     Fixed(SkipTable),
-    /// A string.
     Text,
     /// A sequence of primitives of this many bytes each.
     Primitives(usize),
     /// A sequence of fixed-size structs of at least `least` bytes each.
-    Structs { table: SkipTable, least: usize },
+    Structs {
+        table: SkipTable,
+        least: usize,
+    },
     /// A sequence of elements of variable size, of at least `least` bytes each.
-    Each { body: Box<[Op]>, least: usize },
+    Each {
+        body: Box<[Op]>,
+        least: usize,
+    },
     /// `n` elements of variable size, without a count in front.
-    Times { body: Box<[Op]>, n: usize },
+    Times {
+        body: Box<[Op]>,
+        n: usize,
+    },
     /// The count of a sequence with element `index` on the path; the steps that follow skip those
     /// before it.
-    Enter { index: usize, least: usize },
+    Enter {
+        index: usize,
+        least: usize,
+    },
 }
 
 #[derive(Copy, Clone, Debug)]

@@ -37,60 +37,25 @@ pub struct Sources {
 /// Errors of finding the definitions of a type; that no place has it is not one.
 #[derive(Debug, thiserror::Error)]
 pub enum SourcesError {
-    /// The name is not that of a message type, so it was not searched.
     #[error("`{name}` is not the name of a message type, such as `std_msgs/msg/Header`")]
     Name {
         /// The name, truncated to 80 characters and without control characters.
         name: String,
     },
-    /// A file cannot be read.
     #[error("cannot read `{path}`, the definition of `{type_name}`")]
-    Read {
-        /// The type.
-        type_name: String,
-        /// The file.
-        path: PathBuf,
-        /// The error of the system.
-        source: io::Error,
-    },
+    Read { type_name: String, path: PathBuf, source: io::Error },
     /// A file is not text, or larger than 1 MiB.
     #[error("`{path}`, the definition of `{type_name}`, {what}")]
-    NotText {
-        /// The type.
-        type_name: String,
-        /// The file.
-        path: PathBuf,
-        /// The reason.
-        what: &'static str,
-    },
+    NotText { type_name: String, path: PathBuf, what: &'static str },
     /// The definition in a file, or the result with all types it refers to, is invalid.
     #[error("the definition of `{type_name}` cannot be used")]
-    Unusable {
-        /// The type.
-        type_name: String,
-        /// The cause.
-        source: MessageError,
-    },
-    /// A file contains several definitions.
+    Unusable { type_name: String, source: MessageError },
     #[error("the definition of `{type_name}` contains more than one type")]
-    Several {
-        /// The type.
-        type_name: String,
-    },
-    /// A type refers to one that cannot be found.
+    Several { type_name: String },
     #[error("`{type_name}` refers to `{missing}`, whose definition cannot be found")]
-    Missing {
-        /// The type that refers to it.
-        type_name: String,
-        /// The type that is missing.
-        missing: String,
-    },
-    /// The result exceeds the limits.
+    Missing { type_name: String, missing: String },
     #[error("the definition of `{type_name}` takes more than {MAX_TYPES} types or 8 MiB")]
-    TooLarge {
-        /// The requested type.
-        type_name: String,
-    },
+    TooLarge { type_name: String },
 }
 
 impl Sources {

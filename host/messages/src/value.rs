@@ -54,18 +54,13 @@ impl fmt::Display for ValueKind {
 pub enum MessageValue<'a> {
     /// A boolean; any byte but 0 is true.
     Bool(bool),
-    /// A signed integer.
     Signed(i64),
-    /// An unsigned integer.
     Unsigned(u64),
     /// A floating-point number; `float32` is widened, which is exact.
     Real(f64),
-    /// A string.
     Text(&'a str),
-    /// Bytes.
     Bytes(&'a [u8]),
     /// Numbers as `f64`. 64-bit integers beyond 2^53 are rounded; booleans are 0 and 1.
     Numbers(Vec<f64>),
-    /// Strings.
     Texts(Vec<&'a str>),
 }

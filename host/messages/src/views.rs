@@ -10,9 +10,7 @@ use super::sources::Sources;
 /// step`.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct ImageView<'a> {
-    /// Columns.
     pub width: u32,
-    /// Rows.
     pub height: u32,
     /// Pixel format, such as `rgb8`.
     pub encoding: &'a str,

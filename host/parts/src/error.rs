@@ -3,49 +3,27 @@ use std::path::PathBuf;
 
 use gleaner_base::{Exit, Explain, NotPlain};
 
-/// A Python interpreter that cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RejectedPython {
-    /// Its path.
     pub path: PathBuf,
-    /// The reason.
     pub reason: String,
 }
 
-/// Errors of finding a part of the installation.
 #[derive(Debug, thiserror::Error)]
 pub enum PartsError {
-    /// The path of the running program is unknown.
     #[error("cannot find the path of this program")]
-    NoExecutable {
-        /// The cause.
-        source: io::Error,
-    },
-    /// `GLEANER_HOME` is not an installation.
+    NoExecutable { source: io::Error },
     #[error("GLEANER_HOME is `{}`, which is not an installation of Gleaner", home.display())]
-    Home {
-        /// The folder.
-        home: PathBuf,
-    },
-    /// `GLEANER_PYTHON` cannot be used.
+    Home { home: PathBuf },
     #[error(
         "GLEANER_PYTHON is `{}`, which cannot be used: {}",
         wanted.path.display(),
         wanted.reason
     )]
-    WantedPython {
-        /// The interpreter and the reason.
-        wanted: RejectedPython,
-    },
+    WantedPython { wanted: RejectedPython },
     /// `pyvenv.cfg` of a lambda's environment is not a regular file.
     #[error("cannot read `{}`", config.display())]
-    Environment {
-        /// Its `pyvenv.cfg`.
-        config: PathBuf,
-        /// The cause.
-        source: io::Error,
-    },
-    /// A part was not found.
+    Environment { config: PathBuf, source: io::Error },
     #[error(
         "cannot find {part}; searched in{}",
         lines(folders.iter().map(|folder| folder.display().to_string()))
@@ -53,21 +31,15 @@ pub enum PartsError {
     Missing {
         /// The part, for example `gleaner-runtime`.
         part: String,
-        /// The searched folders, in order.
         folders: Vec<PathBuf>,
         /// The command that makes the part in a checkout.
         made_by: &'static str,
     },
-    /// No Python interpreter can be used.
     #[error(
         "cannot find a working Python 3.9 or newer; tried{}",
         lines(tried.iter().map(|tried| format!("{}: {}", tried.path.display(), tried.reason)))
     )]
-    NoPython {
-        /// The candidates, in order.
-        tried: Vec<RejectedPython>,
-    },
-    /// There is no folder for the cache.
+    NoPython { tried: Vec<RejectedPython> },
     #[error("no folder for the cache: neither XDG_CACHE_HOME nor HOME is an absolute path")]
     NoCache,
 }

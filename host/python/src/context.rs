@@ -72,7 +72,6 @@ impl Context {
         self.config.bind(py)
     }
 
-    /// The lambda's scratch memory.
     #[getter]
     fn scratch<'py>(&self, py: Python<'py>) -> &Bound<'py, Scratch> {
         self.scratch.bind(py)

@@ -65,7 +65,6 @@ fn handler(manifest: &Manifest) -> &'static str {
 struct CallLimits {
     /// Time for the import and `init` together; 0 means no limit.
     init: Duration,
-    /// Time for a wake.
     wake: Duration,
     /// Memory in bytes.
     memory: u64,

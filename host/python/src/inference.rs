@@ -29,7 +29,6 @@ static SESSION: Mutex<Option<Session>> = Mutex::new(None);
 #[pyclass(frozen, module = "_gleaner")]
 pub(crate) struct Tensor(Mutex<inference::Tensor>);
 
-/// A loaded model.
 #[pyclass(frozen, module = "_gleaner")]
 pub(crate) struct Model(inference::Model);
 

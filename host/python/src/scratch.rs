@@ -16,7 +16,6 @@ fn refused(py: Python<'_>, error: &ScratchError) -> PyErr {
     SCRATCH_ERROR.error(py, error.to_string(), error.kind().name())
 }
 
-/// The lambda's scratch memory.
 #[pyclass(frozen, module = "_gleaner")]
 pub(crate) struct Scratch(Session);
 

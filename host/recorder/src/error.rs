@@ -10,181 +10,62 @@ use gleaner_base::{Exit, Explain};
 use gleaner_drives::ReplayError;
 use gleaner_transport::TransportError;
 
-/// An error of recording, storing or recovering clips.
 #[derive(Debug, thiserror::Error)]
 pub enum RecordError {
-    /// A folder or a file cannot be created.
     #[error("cannot create `{}`", path.display())]
-    Create {
-        /// The folder or file.
-        path: PathBuf,
-        /// The error of the system.
-        source: io::Error,
-    },
-    /// The folder's lock cannot be taken, for a reason other than that another process holds it.
+    Create { path: PathBuf, source: io::Error },
     #[error("cannot lock `{}`", path.display())]
-    Lock {
-        /// The lock.
-        path: PathBuf,
-        /// The error of the system.
-        source: io::Error,
-    },
-    /// Another process records into the folder.
+    Lock { path: PathBuf, source: io::Error },
     #[error("another process records into `{}`", folder.display())]
-    Busy {
-        /// The folder.
-        folder: PathBuf,
-    },
-    /// A file or a folder cannot be read.
+    Busy { folder: PathBuf },
     #[error("cannot read `{}`", path.display())]
-    Read {
-        /// The file or folder.
-        path: PathBuf,
-        /// The error of the system.
-        source: io::Error,
-    },
-    /// A file cannot be written.
+    Read { path: PathBuf, source: io::Error },
     #[error("cannot write `{}`", path.display())]
-    Write {
-        /// The file.
-        path: PathBuf,
-        /// The error of the system.
-        source: io::Error,
-    },
-    /// Written data may not be on the disk.
+    Write { path: PathBuf, source: io::Error },
     #[error("cannot sync `{}` to disk", path.display())]
-    Sync {
-        /// The file or folder.
-        path: PathBuf,
-        /// The error of the system.
-        source: io::Error,
-    },
-    /// A complete file cannot be renamed.
+    Sync { path: PathBuf, source: io::Error },
     #[error("cannot rename `{}` to `{}`", from.display(), to.display())]
-    Rename {
-        /// Its temporary name.
-        from: PathBuf,
-        /// Its final name.
-        to: PathBuf,
-        /// The error of the system.
-        source: io::Error,
-    },
-    /// A file that is not needed any more cannot be removed.
+    Rename { from: PathBuf, to: PathBuf, source: io::Error },
     #[error("cannot remove `{}`", path.display())]
-    Remove {
-        /// The file.
-        path: PathBuf,
-        /// The error of the system.
-        source: io::Error,
-    },
+    Remove { path: PathBuf, source: io::Error },
     /// A clip is complete, but not in the list of clips; it will be listed when the folder is
     /// opened the next time.
     #[error("cannot list a clip in `{}`", path.display())]
-    List {
-        /// The list.
-        path: PathBuf,
-        /// The error of the system.
-        source: io::Error,
-    },
-    /// The MCAP writer returned an error.
+    List { path: PathBuf, source: io::Error },
     #[error("cannot write clip `{}`", path.display())]
-    Format {
-        /// The clip.
-        path: PathBuf,
-        /// The cause.
-        source: Box<mcap::McapError>,
-    },
+    Format { path: PathBuf, source: Box<mcap::McapError> },
     /// An unfinished clip of a recorder that died cannot be recovered. It is left unchanged.
     #[error("cannot recover the unfinished clip `{}`", path.display())]
-    Recover {
-        /// The unfinished clip.
-        path: PathBuf,
-        /// The cause.
-        source: Box<RecordError>,
-    },
-    /// An existing clip cannot be read.
+    Recover { path: PathBuf, source: Box<RecordError> },
     #[error("cannot read clip `{}`", path.display())]
-    Unreadable {
-        /// The clip.
-        path: PathBuf,
-        /// The cause.
-        source: Box<ReplayError>,
-    },
-    /// A topic of an existing clip cannot be read.
+    Unreadable { path: PathBuf, source: Box<ReplayError> },
     #[error("cannot read a topic of clip `{}`", path.display())]
-    Topic {
-        /// The clip.
-        path: PathBuf,
-        /// The cause.
-        source: Box<TransportError>,
-    },
-    /// A file of the preroll cannot be written, read or removed.
+    Topic { path: PathBuf, source: Box<TransportError> },
     #[error("cannot keep the preroll in `{}`", path.display())]
-    Preroll {
-        /// The file or folder.
-        path: PathBuf,
-        /// The error of the system.
-        source: io::Error,
-    },
-    /// The memory for the preroll cannot be allocated.
+    Preroll { path: PathBuf, source: io::Error },
     #[error("cannot allocate {} MiB for the preroll", bytes.div_ceil(1 << 20))]
-    PrerollMemory {
-        /// The requested size in bytes.
-        bytes: u64,
-        /// The error of the system.
-        source: TryReserveError,
-    },
-    /// The name, type or definitions of a topic are longer than a clip allows.
+    PrerollMemory { bytes: u64, source: TryReserveError },
     #[error("the {what} of topic `{topic}` has {bytes} bytes; a clip has room for {most}")]
     LongTopic {
         /// Its name, or the beginning of it.
         topic: String,
-        /// The part that is too long.
         what: &'static str,
-        /// Its length in bytes.
         bytes: usize,
-        /// The longest that is allowed, in bytes.
         most: usize,
     },
-    /// A message or record is larger than a clip can hold.
     #[error(
         "{what} of {bytes} bytes is larger than clip `{}` can hold: {most} bytes",
         path.display()
     )]
-    TooLarge {
-        /// The clip.
-        path: PathBuf,
-        /// The kind of data.
-        what: &'static str,
-        /// Its size in bytes.
-        bytes: usize,
-        /// The largest that is allowed, in bytes.
-        most: usize,
-    },
-    /// The thread that writes clips cannot be started, or has ended.
+    TooLarge { path: PathBuf, what: &'static str, bytes: usize, most: usize },
     #[error("the thread that writes clips failed")]
-    Thread {
-        /// The cause.
-        source: io::Error,
-    },
-    /// More topics than a recorder supports.
+    Thread { source: io::Error },
     #[error("a recorder holds at most {most} topics")]
-    TooManyTopics {
-        /// The limit.
-        most: usize,
-    },
-    /// The names and types of the topics are longer in total than a recorder supports.
+    TooManyTopics { most: usize },
     #[error("the names and types of the recorded topics take more than {} KiB", most >> 10)]
-    LongNames {
-        /// The limit in bytes.
-        most: usize,
-    },
-    /// More lambdas than a recorder supports; a restarted lambda counts again.
+    LongNames { most: usize },
     #[error("a recorder holds at most {most} lambdas, counted with each start")]
-    TooManyLambdas {
-        /// The limit.
-        most: usize,
-    },
+    TooManyLambdas { most: usize },
 }
 
 impl RecordError {

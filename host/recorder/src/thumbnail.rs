@@ -19,7 +19,6 @@ const LINE: u32 = 2;
 
 /// A box around an object, in pixels of the image.
 #[derive(Clone, Copy, Debug, PartialEq)]
-#[allow(missing_docs)]
 pub struct ObjectBox {
     pub x: f64,
     pub y: f64,

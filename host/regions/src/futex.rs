@@ -6,7 +6,6 @@ use std::time::Duration;
 use gleaner_buffers::shared::Futex;
 use rustix::thread::futex;
 
-/// The futex of the kernel.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct KernelFutex;
 

@@ -112,7 +112,6 @@ struct Args {
     program: Vec<OsString>,
 }
 
-/// Runs the program `gleaner-shim`.
 pub fn main() -> ExitCode {
     let args = Args::parse();
     // Files that the starter happens to have open must not reach the lambda.

@@ -10,7 +10,6 @@ use rustix::process::{Signal, getpid, kill_process};
 use rustix::time::{ClockId, clock_gettime};
 use signal_hook::consts::{SIGCHLD, SIGHUP, SIGINT, SIGQUIT, SIGTERM};
 
-/// Signals that the shim forwards to the runtime.
 const FORWARDED: [(i32, Signal); 4] = [
     (SIGTERM, Signal::TERM),
     (SIGINT, Signal::INT),

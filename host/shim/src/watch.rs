@@ -27,7 +27,6 @@ pub(crate) struct RunningProcess {
     pub(crate) group: Option<Group>,
 }
 
-/// The end of a child process, and its cause.
 pub(crate) struct ProcessEnd {
     pid: u32,
     status: ExitStatus,

@@ -20,7 +20,6 @@ pub struct CallTime {
     allowed: Duration,
 }
 
-/// Time that a call has used, and its deadline.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct TimeUsed {
     cpu: Duration,
@@ -29,7 +28,6 @@ pub struct TimeUsed {
 }
 
 impl CallTime {
-    /// Begins a call with this deadline.
     pub fn begin(allowed: Duration) -> Self {
         Self { started: Instant::now(), cpu: thread_cpu(), allowed }
     }
@@ -44,7 +42,6 @@ impl CallTime {
         self.started + self.allowed.saturating_mul(WALL_FACTOR)
     }
 
-    /// Returns the time that the call has used.
     pub fn used(&self) -> TimeUsed {
         let cpu = thread_cpu().saturating_sub(self.cpu);
         TimeUsed { cpu, wall: self.started.elapsed(), allowed: self.allowed }
@@ -105,7 +102,6 @@ impl TimeUsed {
     }
 }
 
-/// Returns the CPU time of this thread.
 fn thread_cpu() -> Duration {
     let time = clock_gettime(ClockId::ThreadCPUTime);
     let seconds = u64::try_from(time.tv_sec).unwrap_or(0);

@@ -31,7 +31,6 @@ pub use super::values::{Column, Counts, Identity, Stamps, Tick};
 const SAMPLES_PER_CHECK: usize = 1024;
 const BYTES_PER_CHECK: usize = 1 << 20;
 
-/// Value of a count that is unknown.
 const UNKNOWN: u64 = u64::MAX;
 
 /// The ring of one input, as its lambda sees it.
@@ -70,7 +69,6 @@ pub struct Topic {
 
 /// The ring of an input, before it is a [`Topic`].
 pub struct InputRing {
-    /// Its samples.
     pub reader: RingReader<StoredMeta>,
     /// Number of samples that the lambda sees; the ring may be deeper.
     pub depth: usize,
@@ -124,7 +122,6 @@ impl Topic {
         TensorLimits { per_call, budget }
     }
 
-    /// The input's name.
     pub fn name(&self) -> &str {
         &self.input
     }
@@ -467,12 +464,10 @@ impl Topic {
 pub enum Wake {
     /// A new sample on the input that the schedule names.
     Event(Sample),
-    /// A tick of the period.
     Tick(Tick),
 }
 
 impl Wake {
-    /// Time of the wake, in nanoseconds.
     pub fn at_ns(&self) -> i64 {
         match self {
             Self::Event(sample) => sample.meta().at_ns,

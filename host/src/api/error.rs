@@ -8,9 +8,7 @@ use gleaner_rules::refused;
 
 use super::fuel::OutOfFuel;
 
-/// A failed read of data.
 #[derive(Debug, thiserror::Error)]
-#[allow(missing_docs)]
 pub enum DataError {
     #[error("{}", refused::no_such_input(asked, known))]
     NoSuchInput { asked: String, known: Vec<String> },
@@ -50,7 +48,6 @@ pub enum DataError {
 
 /// Cases of `data-error` in `wit/types.wit`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[allow(missing_docs)]
 pub enum DataErrorKind {
     NoSuchInput,
     NoSuchField,

@@ -31,7 +31,6 @@ impl Field {
         if self.walks() { message_bytes.max(FIELD_BYTES) } else { FIELD_BYTES }
     }
 
-    /// The path as it was written.
     pub fn path(&self) -> &str {
         self.path.path()
     }

@@ -177,17 +177,14 @@ impl Frame {
         Self { source, info: *lease.meta(), pixels: SharedBytes::of_decoded(lease), _taken: taken }
     }
 
-    /// The shape.
     pub fn info(&self) -> Info {
         self.info
     }
 
-    /// Identity of its sample.
     pub fn identity(&self) -> &Identity {
         &self.source.identity
     }
 
-    /// Stamps of its sample.
     pub fn stamps(&self) -> Stamps {
         self.source.stamps
     }

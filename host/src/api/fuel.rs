@@ -24,7 +24,6 @@ struct Account {
     allowed: AtomicU64,
 }
 
-/// The fuel of a guest is used up.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("host calls used all fuel")]
 pub struct OutOfFuel;

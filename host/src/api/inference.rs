@@ -16,7 +16,6 @@ use super::tensor::{prepare_work, prepared_as};
 
 /// The reason why a call failed that creates a tensor, or opens or runs a model.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[allow(missing_docs)]
 pub enum InferenceError {
     #[error("{0}")]
     Unavailable(String),
@@ -40,7 +39,6 @@ pub enum InferenceError {
 
 /// Cases of `inference-error` in `wit/inference.wit`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[allow(missing_docs)]
 pub enum InferenceErrorKind {
     Unavailable,
     NoSuchModel,
@@ -109,15 +107,12 @@ impl InferenceError {
 pub struct DetectOptions {
     /// Classes to return, by name or by index as text; empty for all.
     pub classes: Vec<String>,
-    /// Minimum score.
     pub min_score: f32,
     /// Overlap above which the detection with the lower score is dropped.
     pub max_iou: f32,
-    /// Maximum number of detections.
     pub max_count: u32,
 }
 
-/// A loaded model.
 pub struct Model {
     models: Models,
     limits: TensorLimits,
@@ -147,12 +142,10 @@ impl Model {
         Ok(Self { models: models.clone(), limits: limits.clone(), entry, opened, detector })
     }
 
-    /// Its inputs.
     pub fn inputs(&self) -> &[TensorInfo] {
         &self.opened.inputs
     }
 
-    /// Its outputs.
     pub fn outputs(&self) -> &[TensorInfo] {
         &self.opened.outputs
     }
@@ -246,7 +239,6 @@ impl Model {
         )
     }
 
-    /// Returns the name of a class.
     pub fn label(&self, class: u32) -> String {
         let label = usize::try_from(class).ok().and_then(|class| self.entry.labels.get(class));
         label.cloned().unwrap_or_else(|| class.to_string())

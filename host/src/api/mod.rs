@@ -97,18 +97,15 @@ impl Session {
         Self { state, fuel, models: Models::default(), tensors }
     }
 
-    /// The same session with these models.
     #[must_use]
     pub fn with_models(self, models: Models) -> Self {
         Self { models, ..self }
     }
 
-    /// The lambda's models.
     pub fn models(&self) -> &Models {
         &self.models
     }
 
-    /// Limits of the lambda's tensors.
     pub fn tensors(&self) -> &TensorLimits {
         &self.tensors
     }

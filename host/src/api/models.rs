@@ -36,9 +36,7 @@ const RUNTIME_MAX: usize = 256;
 
 /// A `[[model]]` of the manifest.
 pub struct ModelEntry {
-    /// Its name.
     pub name: String,
-    /// The layout of a detector.
     pub layout: Option<DetectorLayout>,
     /// Names of its classes.
     pub labels: Vec<String>,
@@ -69,7 +67,6 @@ struct Connection {
     memory: u64,
     /// The region for inputs, and its size.
     inputs: Option<(File, u64)>,
-    /// The region for outputs.
     outputs: Option<File>,
     opened: Vec<(String, Arc<OpenedModel>)>,
     /// Name and runtime of all that were opened, each once, also by processes before this one.
@@ -78,16 +75,12 @@ struct Connection {
     ended: Option<String>,
 }
 
-/// A model that is loaded.
 #[derive(Debug)]
 pub struct OpenedModel {
-    /// Its inputs.
     pub inputs: Vec<TensorInfo>,
-    /// Its outputs.
     pub outputs: Vec<TensorInfo>,
     /// Backend, version, provider and threads.
     pub runtime: String,
-    /// Statements of its export about a detector.
     pub note: ExportNote,
 }
 
@@ -334,7 +327,6 @@ impl Connection {
         }
     }
 
-    /// Waits until the process runs, or until `until`.
     fn wait_for_process(&mut self, until: Option<Instant>) -> Result<(), InferenceError> {
         self.note_process()?;
         while self.ended.is_some() {

@@ -78,7 +78,6 @@ fn attribute(value: Value) -> Option<AttributeValue> {
 }
 
 impl Topic {
-    /// Resets how far back the lambda has looked.
     pub fn reset_look_back(&self) {
         self.look_back.reset();
     }

@@ -25,13 +25,11 @@ impl Sample {
         Self { topic, lease }
     }
 
-    /// Unique identity of the sample.
     pub fn identity(&self) -> Identity {
         let meta = self.meta();
         Identity { topic: self.topic.topic.clone(), writer: meta.writer, seq: meta.seq }
     }
 
-    /// Timestamps of the sample.
     pub fn stamps(&self) -> Stamps {
         let meta = self.meta();
         let header = self.topic.headers.get(usize::from(self.layout())).and_then(Option::as_ref);
@@ -89,7 +87,6 @@ impl Sample {
         &self.lease
     }
 
-    /// Returns whether the message is big-endian.
     pub fn big_endian(&self) -> bool {
         self.meta().endian == Endian::Big
     }
@@ -144,7 +141,6 @@ impl Sample {
             })
     }
 
-    /// Its position in the ring.
     pub(crate) fn position(&self) -> Option<u64> {
         self.lease.position()
     }
@@ -167,7 +163,6 @@ impl Sample {
         &self.lease
     }
 
-    /// The topic it arrived on.
     pub fn topic(&self) -> &Arc<Topic> {
         &self.topic
     }

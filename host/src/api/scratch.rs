@@ -18,15 +18,12 @@ const LISTED_BYTES: usize = 64;
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error(transparent)]
 pub enum ScratchError {
-    /// A rule of scratch refuses it.
     Refused(#[from] Refusal),
-    /// The lambda cannot pay for the call.
     OutOfFuel(#[from] OutOfFuel),
 }
 
 /// Cases of `scratch-error` in `wit/scratch.wit`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[allow(missing_docs)]
 pub enum ScratchErrorKind {
     NoRoom,
     NoSuchEntry,

@@ -28,9 +28,7 @@ pub struct Tensor {
 /// The content of a tensor. Clones share its bytes, which never change while one lives.
 #[derive(Clone)]
 pub struct TensorContent {
-    /// Type of the elements.
     pub element: Element,
-    /// Length of each dimension.
     pub shape: Vec<u32>,
     /// The elements, little-endian.
     pub bytes: Arc<Vec<u8>>,
@@ -172,7 +170,6 @@ fn of_frame(error: DataError) -> InferenceError {
 }
 
 impl Tensor {
-    /// Type, shape and elements.
     pub fn content(&self) -> &TensorContent {
         &self.content
     }

@@ -56,7 +56,6 @@ impl LookBack {
 pub struct SumsBefore {
     /// Sum of their digests, modulo 2^32.
     pub digest: u32,
-    /// Number of refused samples.
     pub refused: u64,
 }
 

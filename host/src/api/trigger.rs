@@ -13,15 +13,12 @@ use super::fuel::OutOfFuel;
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[error(transparent)]
 pub enum TriggerError {
-    /// A rule of triggers refuses it.
     Refused(#[from] Refusal),
-    /// The lambda cannot pay for it.
     OutOfFuel(#[from] OutOfFuel),
 }
 
 /// Cases of `trigger-error` in `wit/trigger.wit`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[allow(missing_docs)]
 pub enum TriggerErrorKind {
     Invalid,
     TooMany,

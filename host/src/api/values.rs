@@ -21,12 +21,10 @@ pub struct Counts {
     pub skipped: u64,
 }
 
-/// Unique identity of a sample.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Identity {
     /// ROS topic, as in the manifest.
     pub topic: String,
-    /// The writer that sent it.
     pub writer: Guid,
     /// Sequence number, strictly increasing for each writer.
     pub seq: u64,
@@ -48,7 +46,6 @@ pub struct Stamps {
 pub struct Column {
     /// [`Stamps::at_ns`] of each sample.
     pub at_ns: Vec<i64>,
-    /// The field's values.
     pub values: Vec<f64>,
 }
 

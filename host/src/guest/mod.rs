@@ -115,7 +115,6 @@ pub struct Totals {
     pub counts: Vec<Counts>,
     /// Time spent decoding images, in ns.
     pub decode_ns: u64,
-    /// Curves of the values that the lambda read.
     pub curves: Vec<Curve>,
     /// Number of fields that the lambda read beyond the maximum number of curves.
     pub curves_omitted: u64,
@@ -134,9 +133,7 @@ impl Totals {
     }
 }
 
-/// Outcome of a wake.
 pub struct WakeOutcome {
-    /// The fault that ended it, if any.
     pub result: Result<(), Fault>,
     /// Fuel used. `None` for Python, which has none, and where it depends on the machine.
     pub fuel: Option<u64>,

@@ -19,9 +19,7 @@ use crate::isolation::Isolation;
 /// is interrupted.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct KillTimeouts {
-    /// Timeout of `init`.
     pub init: Duration,
-    /// Timeout of a wake.
     pub wake: Duration,
 }
 
@@ -49,7 +47,6 @@ pub struct SandboxedGuest {
     /// Memory of this process that the lambda may use, in bytes; `None` where its kind counts its
     /// own memory.
     memory: Option<u64>,
-    /// The models that it runs.
     models: Models,
     /// The engine without them.
     engine: OnceLock<LambdaEngine>,

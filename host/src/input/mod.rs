@@ -26,9 +26,7 @@ pub(crate) use fed::continue_fed_input;
 pub use fed::open_fed_inputs;
 pub use filled::open_inputs;
 
-/// An input that could not be set up.
 #[derive(Debug, thiserror::Error)]
-#[allow(missing_docs)]
 pub enum InputError {
     #[error("cannot lay out the memory of input `{input}`")]
     Layout { input: String, source: PoolError },
@@ -90,7 +88,6 @@ impl Remap {
     }
 }
 
-/// Limits that all inputs of a lambda share.
 struct SharedLimits {
     budget: Budget,
     per_call: PerCall,
@@ -141,7 +138,6 @@ fn pool<M: Copy + Send + Sync + 'static>(
     Pool::new(region, slots, slot_bytes).map_err(layout)
 }
 
-/// Logs that an input has no message definitions.
 fn warn_of_missing_definitions(input: &InputSpec, type_name: &str) {
     let input = &input.name;
     tracing::warn!(%input, r#type = %type_name, "no message definitions: fields cannot be read");

@@ -13,9 +13,7 @@ use sha2::{Digest, Sha256};
 
 use crate::input::Remap;
 
-/// A build that cannot be identified.
 #[derive(Debug, thiserror::Error)]
-#[allow(missing_docs)]
 pub enum IdentityError {
     #[error("cannot take the digest of `{}`", path.display())]
     Digest { path: PathBuf, source: io::Error },
@@ -41,13 +39,10 @@ impl Explain for IdentityError {
 
 /// Everything that a decision of a lambda can depend on, except its samples.
 pub struct LambdaIdentity<'a> {
-    /// Its manifest.
     pub manifest: &'a Manifest,
-    /// Its build.
     pub build: &'a BuildDir,
     /// All of `[config]`, with overrides.
     pub config: &'a [(String, ConfigValue)],
-    /// Other names for topics of the manifest.
     pub remaps: &'a [Remap],
     /// The engine that runs it, with its version.
     pub engine: String,

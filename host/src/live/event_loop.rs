@@ -39,7 +39,6 @@ pub(super) struct LiveEventLoop {
     pub(super) announcer: Option<Announcer>,
     pub(super) watch: StatusReporter,
     pub(super) feed: LastingFeed,
-    /// Bell of the current ingress.
     pub(super) bell: FeedBell,
     /// Number of ingresses before it.
     pub(super) connections: u32,

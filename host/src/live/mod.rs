@@ -45,11 +45,9 @@ use crate::session_setup::{ConfiguredLambda, Load, RunMode, SessionSetup, not_st
 
 /// A live run, without the set-up of its process.
 pub struct LiveRun<'a> {
-    /// The lambda.
     pub lambda: ConfiguredLambda,
     /// Its manifest, with the limits that hold.
     pub manifest: Manifest,
-    /// Its settings.
     pub settings: Settings,
     /// The connection to the ingress. It grants the inputs of the manifest, with their indexes as
     /// ids, and then the topics of [`Settings::round_trip`] and [`Settings::announce`], as far as
@@ -60,18 +58,15 @@ pub struct LiveRun<'a> {
     pub starter: Option<OwnedFd>,
     /// The socket to the recorder, if there is one.
     pub recorder: Option<OwnedFd>,
-    /// The pipe for results.
     pub results: ResultsPipe,
     /// The page that shows the shim how long this thread may be busy.
     pub pulse: Pulse,
     /// Drops the privileges that the process no longer needs, before the lambda is entered; returns
     /// the layers of the sandbox.
     pub close: &'a mut dyn FnMut() -> Result<Vec<Layer>, Failure>,
-    /// Set to end the run.
     pub stop: &'a AtomicBool,
 }
 
-/// Settings of a live run.
 #[derive(Clone, Debug)]
 pub struct Settings {
     /// Folder of the results, for reports.
@@ -80,7 +75,6 @@ pub struct Settings {
     pub all: bool,
     /// Number of earlier starts of this lambda's process.
     pub restarts: u32,
-    /// The vehicle's clock.
     pub clock: Clock,
     /// The topic on which each wake is answered, if any.
     pub round_trip: Option<String>,

@@ -25,7 +25,6 @@ pub(crate) const UNWRITTEN: u64 = 48 << 20;
 #[derive(Args, Clone, Debug)]
 pub struct RunArgs {
     #[command(flatten)]
-    #[allow(missing_docs)]
     pub lambda_args: LambdaArgs,
     /// Folder of the results, for reports: the process that created their pipe writes there.
     #[arg(long, value_name = "DIR")]
@@ -47,11 +46,8 @@ pub struct RunArgs {
     pub restarts: u32,
 }
 
-/// A lambda to run live.
 pub struct LiveJob {
-    /// The lambda, with its settings.
     pub lambda: ConfiguredLambda,
-    /// Its manifest.
     pub manifest: Manifest,
     settings: Settings,
 }

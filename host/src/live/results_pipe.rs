@@ -22,12 +22,10 @@ const WAITING: usize = 2 * RESULT_ITEM_MAX;
 /// Number of waiting bytes from which on they are sent in any case.
 const FULL: usize = 32 << 10;
 
-/// The pipe to the shim.
 pub struct ResultsPipe {
     pipe: File,
     /// Lines that the pipe has not accepted; it may have accepted a part of the first.
     waiting: VecDeque<u8>,
-    /// The line that is being built.
     line: Vec<u8>,
     unwritten: u64,
     /// The page in which the shim counts what it cannot write.

@@ -19,7 +19,6 @@ const REPORTS: usize = 256;
 const LAST_RESULTS: Duration = Duration::from_secs(20);
 const LAST_REPORT: Duration = Duration::from_secs(2);
 
-/// The writing end of results and reports.
 pub(super) struct ResultsWriter {
     pages: ResultsPipe,
     /// Set if decisions without trigger and fault are results, too.

@@ -44,7 +44,6 @@ pub(super) struct Around<'a> {
     pub(super) recorder_link: Option<LinkLosses>,
 }
 
-/// Counts and spreads of one lambda.
 pub(super) struct StatusReporter {
     base: LiveStatus,
     clock: Clock,

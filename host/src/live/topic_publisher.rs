@@ -20,12 +20,10 @@ impl TopicPublisher {
         self.publisher = publisher;
     }
 
-    /// Number of messages that were not sent.
     pub(super) fn unsent(&self) -> u64 {
         self.unsent
     }
 
-    /// Sends the message that `fill` writes.
     pub(super) fn publish(&mut self, fill: impl FnOnce(&mut CdrWriter) -> &mut CdrWriter) {
         self.message.clear();
         fill(&mut self.message);

@@ -40,7 +40,6 @@ impl DriveSpan {
     }
 }
 
-/// The end of a loop over a drive.
 pub(super) struct LoopEnd {
     /// Stamp of the last sample; 0 if there was none.
     pub(super) at_ns: i64,

@@ -175,7 +175,6 @@ fn read(
     }
 }
 
-/// Statistics of one topic so far.
 struct TopicInspection {
     info: DriveTopicInfo,
     first: Arc<FirstMessage>,

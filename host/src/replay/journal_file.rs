@@ -82,7 +82,6 @@ fn is_journal(file: &File) -> bool {
     !matches!(JournalReader::open(file), Err(JournalError::NotAJournal | JournalError::Read { .. }))
 }
 
-/// The journal of a replay.
 pub struct JournalFile {
     path: PathBuf,
     writer: journal::JournalWriter<File>,

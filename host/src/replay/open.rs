@@ -68,7 +68,6 @@ fn opening(options: &ReplayOptions) -> replay::DriveOptions {
     }
 }
 
-/// An error of a drive, for users.
 #[derive(Debug, thiserror::Error)]
 #[error(transparent)]
 pub(super) struct DriveError(pub(super) ReplayError);

@@ -20,7 +20,6 @@ use crate::session_setup::{ConfiguredLambda, LambdaArgs, RESULTS};
 #[derive(Args, Clone, Debug)]
 pub struct ReplayArgs {
     #[command(flatten)]
-    #[allow(missing_docs)]
     pub lambda_args: LambdaArgs,
     /// MCAP files, databases and directories of rosbag2. Separate drives are reported, and not
     /// replayed.
@@ -76,15 +75,12 @@ pub struct VerifyArgs {
     pub starter_passes_inference: bool,
 }
 
-/// A lambda and the drives to run it over.
 pub struct ReplayOptions {
-    /// The lambda.
     pub lambda: ConfiguredLambda,
     /// The drives, merged by time.
     pub drives: Drives,
     /// Set if drives that overlap in time may have a topic in common.
     pub merge: bool,
-    /// The time range that is replayed.
     pub range: RequestedRange,
     /// Patterns of the topics that clips hold; empty for those of the manifest.
     pub topics: Vec<String>,
@@ -103,15 +99,12 @@ pub struct Drives {
 }
 
 pub(super) struct Results {
-    /// Folder of the results.
     pub(super) out: PathBuf,
     /// Set if every decision is written.
     pub(super) all: bool,
     /// Set if clips are written.
     pub(super) record: bool,
-    /// Path of the journal, if one is written.
     pub(super) journal: Option<PathBuf>,
-    /// Number of replays.
     pub(super) repeat: u32,
 }
 
@@ -123,9 +116,7 @@ pub(super) enum Task {
 
 /// A replay, or a comparison with a journal.
 pub struct ReplayJob {
-    /// The lambda and its drives.
     pub options: ReplayOptions,
-    /// The lambda's manifest.
     pub manifest: Manifest,
     pub(super) task: Task,
 }

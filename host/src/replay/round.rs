@@ -35,7 +35,6 @@ use crate::session_setup::{
 
 /// Interval of progress reports; a shorter one is not visible to a user.
 const PROGRESS: Duration = Duration::from_millis(100);
-/// Number of samples between two readings of the clock.
 const SAMPLES_PER_CLOCK_READ: u64 = 256;
 
 struct ReplayLoop<'a> {
@@ -129,7 +128,6 @@ impl ReplayLoop<'_> {
         Ok(self.output.log(log)?)
     }
 
-    /// Flushes the results and the journal.
     fn flush(&mut self) -> Result<(), Failure> {
         self.output.flush()?;
         Ok(self.journal.as_mut().map_or(Ok(()), JournalFile::flush)?)

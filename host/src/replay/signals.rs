@@ -16,14 +16,12 @@ use crate::api::data::Topic;
 use crate::guest::Totals;
 use crate::session_setup::{Output, OutputError};
 
-/// Number of histogram bins per decade.
 const BINS_PER_DECADE: f64 = 12.0;
 
 /// Largest value, to which greater ones are clamped: 13 days in ns, and more fuel than a wake may
 /// have.
 const MOST: u64 = 1 << 50;
 
-/// Collects the signals, wake by wake.
 pub(super) struct SignalCollector {
     curves: Arc<Curves>,
     run: Histogram<u64>,

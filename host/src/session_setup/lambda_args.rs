@@ -38,13 +38,11 @@ pub struct LambdaArgs {
 
 /// A lambda with its settings, checked.
 pub struct ConfiguredLambda {
-    /// Its folder.
     pub folder: PathBuf,
     /// Its build, which is not older than its sources.
     pub build: BuildDir,
     /// All of `[config]`: the defaults with the overrides applied.
     pub config: Vec<(String, ConfigValue)>,
-    /// Other names for topics of the manifest.
     pub remaps: Vec<Remap>,
     /// The configuration of the vehicle, which an interpreter reads again.
     pub vehicle: Option<PathBuf>,

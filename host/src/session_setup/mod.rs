@@ -47,7 +47,6 @@ pub struct SessionSetup {
     pub inputs: Vec<Arc<Topic>>,
     /// The lambda's view of inputs, and its triggers and log.
     pub session: Session,
-    /// The guest that runs it.
     pub guest: Box<dyn Guest>,
 }
 

@@ -12,17 +12,14 @@ const SAMPLES_MAX: usize = 1000;
 const BYTES_MAX: usize = 16 << 20;
 /// Most bytes of several topics together.
 const ALL_BYTES_MAX: usize = 64 << 20;
-/// A sample of a latched topic.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct LatchedSample {
-    /// Its metadata.
     pub meta: SampleMeta,
     /// Its bytes, which copies share.
     pub cdr: Arc<[u8]>,
 }
 
 impl LatchedSample {
-    /// Copies a sample.
     pub fn new(meta: &SampleMeta, cdr: &[u8]) -> LatchedSample {
         LatchedSample { meta: *meta, cdr: cdr.into() }
     }

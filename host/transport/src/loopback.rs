@@ -38,7 +38,6 @@ struct LoopbackTopic {
 }
 
 impl Loopback {
-    /// Creates a transport without topics.
     pub fn new() -> Self {
         Self::default()
     }

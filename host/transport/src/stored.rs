@@ -4,14 +4,12 @@ use gleaner_messages::Endian;
 
 use crate::transport::{Guid, SampleMeta};
 
-/// Words of a [`StoredMeta`] in shared memory.
 pub const STORED_WORDS: usize = 12;
 
 /// Metadata of a sample in a ring, and sums over all samples of its topic up to it. With the sums
 /// of two samples, a reader knows what arrived between them.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct StoredMeta {
-    /// Metadata of the sample.
     pub sample: SampleMeta,
     /// Sum of the digests of all samples up to and including this one, modulo 2^32; 0 while digests
     /// are off.
@@ -21,7 +19,6 @@ pub struct StoredMeta {
 }
 
 impl StoredMeta {
-    /// Converts it to words.
     pub fn words(&self) -> [u64; STORED_WORDS] {
         let Self { sample, digests, refused } = *self;
         let [high, low] = [&sample.writer.0[..8], &sample.writer.0[8..]]
@@ -91,7 +88,6 @@ impl ArrivalSums {
         self.digests = None;
     }
 
-    /// Returns whether digests are added.
     pub fn has_digests(&self) -> bool {
         self.digests.is_some()
     }
@@ -101,7 +97,6 @@ impl ArrivalSums {
         self.digests.unwrap_or(0)
     }
 
-    /// Returns the number of refused samples so far.
     pub fn refused(&self) -> u64 {
         self.refused
     }
@@ -114,7 +109,6 @@ impl ArrivalSums {
         StoredMeta { sample: *sample, digests: self.digests(), refused: self.refused }
     }
 
-    /// Counts a refused sample.
     pub fn refuse(&mut self) {
         self.refused += 1;
     }
@@ -139,12 +133,10 @@ pub struct TopicCounters {
 }
 
 impl TopicCounters {
-    /// Converts them to words.
     pub fn words(&self) -> [u64; 8] {
         [self.too_big, self.lost.map_or(0, |lost| lost.saturating_add(1)), 0, 0, 0, 0, 0, 0]
     }
 
-    /// Converts words back.
     pub fn of_words(words: &[u64; 8]) -> Self {
         Self { too_big: words[0], lost: words[1].checked_sub(1) }
     }

@@ -54,19 +54,16 @@ impl fmt::Display for Guid {
     }
 }
 
-/// Metadata of a sample.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct SampleMeta {
     /// Time by the clock that orders all samples, in ns. Replay: log time. Live: receive time.
     pub at_ns: i64,
     /// Time of publication, in ns of the writer's clock.
     pub publish_ns: i64,
-    /// The writer.
     pub writer: Guid,
     /// Sequence number: strictly increasing for each writer, at least 1. A gap is a loss before
     /// this transport.
     pub seq: u64,
-    /// Byte order of the CDR payload.
     pub endian: Endian,
     /// Bytes 2 and 3 of the encapsulation header, nearly always zeros. Unused, but with them a
     /// recorder can write the original message byte for byte.
@@ -99,7 +96,6 @@ impl SampleMeta {
     }
 }
 
-/// The result of delivering a sample to a sink.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Hash)]
 pub enum Delivery {
     /// Copied and kept.
@@ -138,7 +134,6 @@ pub trait Sink: Send + Sync {
     fn accept(&self, _meta: &SampleMeta) {}
 }
 
-/// A topic of a source.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct DiscoveredTopic {
     /// Absolute topic name.
@@ -196,7 +191,6 @@ pub trait Transport {
         DefinitionsSearch::Ended
     }
 
-    /// Returns the state of a subscription.
     fn status(&self, _subscription: Subscription) -> ReceptionStatus {
         ReceptionStatus::default()
     }
@@ -213,79 +207,37 @@ pub enum DefinitionsSearch {
     Ended,
 }
 
-/// Reasons why a topic cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum TransportError {
-    /// The source has no topic of this name.
     #[error("no topic `{topic}`{}; there are: {}", hint(nearest), list(known))]
     NoSuchTopic {
-        /// The requested name.
         topic: String,
         /// The topics of the source, sorted.
         known: Vec<String>,
         /// The most similar name, if one is similar.
         nearest: Option<String>,
     },
-    /// The topic carries another type.
     #[error("topic `{topic}` has type `{found}`, not `{wanted}`")]
-    WrongType {
-        /// The topic.
-        topic: String,
-        /// The requested type.
-        wanted: String,
-        /// The type of the topic.
-        found: String,
-    },
-    /// The topic has an unsupported encoding.
+    WrongType { topic: String, wanted: String, found: String },
     #[error("topic `{topic}` has {what} `{found}`; only `{wanted}` can be read")]
     Encoding {
-        /// The topic.
         topic: String,
         /// The encoding that is meant: "message encoding" or "schema encoding".
         what: &'static str,
-        /// The encoding of the source.
         found: String,
-        /// The supported encoding.
         wanted: &'static str,
     },
-    /// The source does not carry the definitions of this topic's type.
     #[error("topic `{topic}` has no message definitions for its type `{type_name}`")]
-    NoDefinitions {
-        /// The topic.
-        topic: String,
-        /// Its type.
-        type_name: String,
-    },
-    /// The definitions that the source carries are invalid.
+    NoDefinitions { topic: String, type_name: String },
     #[error("the message definitions of topic `{topic}` cannot be used")]
-    BadDefinitions {
-        /// The topic.
-        topic: String,
-        /// The cause.
-        source: MessageError,
-    },
+    BadDefinitions { topic: String, source: MessageError },
     /// The source does not carry definitions, and those that were found elsewhere are invalid.
     #[error("the message definitions of topic `{topic}` cannot be used")]
-    UnusableDefinitions {
-        /// The topic.
-        topic: String,
-        /// The cause.
-        source: Box<SourcesError>,
-    },
-    /// The layout of some messages of the topic is unknown.
+    UnusableDefinitions { topic: String, source: Box<SourcesError> },
     #[error("the layout of some messages of topic `{topic}` is unknown: {why}")]
-    UnknownLayout {
-        /// The topic.
-        topic: String,
-        /// The cause.
-        why: &'static str,
-    },
-    /// The replay has begun: subscriptions are made before the first step.
+    UnknownLayout { topic: String, why: &'static str },
     #[error("topic `{topic}` was subscribed after the replay started")]
-    AlreadyStarted {
-        /// The topic.
-        topic: String,
-    },
+    AlreadyStarted { topic: String },
 }
 
 /// Maximum number of topics named in an error.

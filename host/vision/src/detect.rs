@@ -7,7 +7,6 @@ use crate::heads::{Candidate, Classes, DetectorHead, Edges};
 use crate::layout::DetectorLayout;
 use crate::placement::Placed;
 
-/// Largest number of detections of a frame.
 pub const MAX_DETECTIONS: u32 = 1024;
 
 /// Largest number of objects whose boxes are compared; of more, those with the highest scores.
@@ -19,9 +18,7 @@ const NORMALISED_MAX: f32 = 2.0;
 /// An output of a model, in row-major order.
 #[derive(Debug, Clone, Copy)]
 pub struct OutputView<'a> {
-    /// Length of each dimension.
     pub shape: &'a [u32],
-    /// All values.
     pub values: &'a [f32],
 }
 

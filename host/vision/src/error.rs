@@ -11,149 +11,76 @@ const LISTED_DIMENSIONS: usize = 8;
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum VisionError {
-    /// A frame whose pixels have no colour, or more than 8 bits.
     #[error(
         "frame of {}: a tensor is made of rgb8, bgr8, rgba8, bgra8, mono8, uyvy or yuyv; {}",
         encoding.name(),
         way_out(*encoding)
     )]
-    Encoding {
-        /// The encoding of the frame.
-        encoding: Encoding,
-    },
-    /// A side of the tensor is 0 or too long.
+    Encoding { encoding: Encoding },
     #[error("tensor of {width}x{height} pixels: each side must be 1 to {MAX_TENSOR_SIDE}")]
-    TensorSize {
-        /// Pixels per row.
-        width: u32,
-        /// Rows.
-        height: u32,
-    },
-    /// A number of the normalisation that is not finite, or a deviation of 0.
+    TensorSize { width: u32, height: u32 },
     #[error("{name} of the tensor is {value}; it must be finite, and a deviation not 0")]
     Normalisation {
         /// `scale`, `mean` or `deviation`.
         name: &'static str,
-        /// The refused value.
         value: f32,
     },
-    /// The length of the caller's slice is not that of the tensor.
     #[error("tensor needs {needed} bytes; the output has {found}")]
-    TensorLength {
-        /// Bytes of the tensor.
-        needed: usize,
-        /// Bytes of the caller's slice.
-        found: usize,
-    },
+    TensorLength { needed: usize, found: usize },
     /// An operation on pixels failed, or was stopped by the caller.
     #[error(transparent)]
     Pixels(#[from] PixelError),
-    /// A layout that does not exist.
     #[error("layout `{name}` is not known; known are {known}")]
     UnknownLayout {
         /// The name, cut to 40 characters.
         name: String,
-        /// The known names.
         known: String,
     },
-    /// A model whose input is not a picture of three channels.
     #[error(
         "layout `{layout}` needs one input [1, 3, height, width] or [1, height, width, 3]; \
          the model has {found}"
     )]
-    InputShape {
-        /// Name of the layout.
-        layout: &'static str,
-        /// Shape of the input.
-        found: String,
-    },
-    /// A model whose input has no fixed size.
+    InputShape { layout: &'static str, found: String },
     #[error(
         "layout `{layout}` needs an input of fixed size; the model has {found}: export it with a \
          fixed size, such as 640x640"
     )]
-    DynamicInput {
-        /// Name of the layout.
-        layout: &'static str,
-        /// Shape of the input.
-        found: String,
-    },
-    /// Outputs that another kind of model has.
+    DynamicInput { layout: &'static str, found: String },
     #[error(
         "layout `{layout}` needs one output {expected} for an input of {width}x{height}; \
          the model has {found}"
     )]
     OutputShape {
-        /// Name of the layout.
         layout: &'static str,
-        /// The shape that the layout needs.
         expected: String,
         /// Width of the input in pixels.
         width: u32,
         /// Height of the input in pixels.
         height: u32,
-        /// Shapes of the outputs.
         found: String,
     },
-    /// A model that no layout decodes.
     #[error(
         "layout `{layout}` cannot decode this model, which is {kind}: call `run`, and decode its \
          output in the lambda, or use a detector of one of the families in docs/models.md"
     )]
-    OtherModel {
-        /// Name of the layout.
-        layout: &'static str,
-        /// The family or the task of the model.
-        kind: String,
-    },
-    /// A score that no detector gives.
+    OtherModel { layout: &'static str, kind: String },
     #[error(
         "the model returned {value} as a score of layout `{layout}`; scores are 0 to 1: the model \
          is of another family, or its input is not as `layout` states"
     )]
-    Score {
-        /// Name of the layout.
-        layout: &'static str,
-        /// The number in the place of a score.
-        value: f32,
-    },
-    /// Boxes that are not in pixels.
+    Score { layout: &'static str, value: f32 },
     #[error(
         "all boxes that the model returned end below {limit} pixels, and layout `{layout}` has \
          boxes in pixels of the input: the model is of another family, such as RT-DETR, or was \
          exported with boxes from 0 to 1"
     )]
-    Normalised {
-        /// Name of the layout.
-        layout: &'static str,
-        /// The largest edge of such boxes.
-        limit: f32,
-    },
-    /// An output whose number of values contradicts its shape.
+    Normalised { layout: &'static str, limit: f32 },
     #[error("output {shape} of the model has {found} values")]
-    OutputLength {
-        /// Shape of the output.
-        shape: String,
-        /// Number of values.
-        found: usize,
-    },
-    /// A class that the model does not have.
+    OutputLength { shape: String, found: usize },
     #[error("class {class} is wanted; the model has classes 0 to {}", classes.saturating_sub(1))]
-    Class {
-        /// The class.
-        class: u32,
-        /// Number of classes of the model.
-        classes: u32,
-    },
-    /// An option of a detection that is not between 0 and 1.
+    Class { class: u32, classes: u32 },
     #[error("{name} is {value}; it must be 0 to 1")]
-    Fraction {
-        /// Name of the option.
-        name: &'static str,
-        /// The refused value.
-        value: f32,
-    },
-    /// The placement of a frame that no tensor can have.
+    Fraction { name: &'static str, value: f32 },
     #[error("placement of the frame in the tensor is invalid: take it from the prepared tensor")]
     Placed,
 }

@@ -7,7 +7,6 @@ use crate::layout::{BINS, BOX, DetectorLayout, Form, SIDES};
 pub(crate) struct Candidate {
     pub(crate) score: f32,
     pub(crate) class: u32,
-    /// Index of its anchor.
     pub(crate) anchor: usize,
 }
 
@@ -156,7 +155,6 @@ impl<'a> DetectorHead<'a> {
 /// Wanted classes, which the model has.
 #[derive(Debug, Clone)]
 pub(crate) enum Classes<'a> {
-    /// All of the model.
     All,
     /// Sorted, each once.
     Some(&'a [u32]),

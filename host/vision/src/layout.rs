@@ -65,7 +65,6 @@ pub(crate) struct Form {
 }
 
 impl DetectorLayout {
-    /// All layouts.
     pub const ALL: [Self; 4] = [Self::Ultralytics, Self::Yolox, Self::NmsFree, Self::Nanodet];
 
     /// Returns the name in a manifest.

@@ -18,7 +18,6 @@ pub struct Preprocess {
     pub width: u32,
     /// Height of the tensor in pixels, 1 to [`MAX_TENSOR_SIDE`].
     pub height: u32,
-    /// Place of the frame in the tensor.
     pub placement: Placement,
     /// Grey level of the border.
     pub fill: u8,
@@ -64,7 +63,6 @@ impl Preprocess {
         Ok(())
     }
 
-    /// Returns the shape of the tensor.
     pub fn shape(&self) -> [u32; 4] {
         if self.channels_last {
             [1, self.height, self.width, 3]
@@ -98,7 +96,6 @@ pub struct Preparer {
 }
 
 impl Preparer {
-    /// Creates a preparer without buffers.
     pub fn new() -> Self {
         Self::default()
     }

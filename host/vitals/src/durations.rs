@@ -19,7 +19,6 @@ impl Default for IntervalDurations {
 }
 
 impl IntervalDurations {
-    /// Creates empty statistics.
     pub fn new() -> Self {
         let empty =
             || Histogram::new_with_max(MAX_NS, 2).expect("two digits up to a day are valid bounds");
@@ -40,7 +39,6 @@ impl IntervalDurations {
         stats
     }
 
-    /// Returns the statistics since the start.
     pub fn all(&self) -> Option<DurationStats> {
         stats(&self.all)
     }
@@ -57,7 +55,6 @@ impl Default for Durations {
 }
 
 impl Durations {
-    /// Creates empty statistics.
     pub fn new() -> Self {
         Self(Histogram::new(2).expect("two digits are valid"))
     }
@@ -69,7 +66,6 @@ impl Durations {
         self.0.record(ns).expect("it grows as far as it has to");
     }
 
-    /// Returns the statistics of all durations.
     pub fn all(&self) -> Option<DurationStats> {
         stats(&self.0)
     }

@@ -180,7 +180,6 @@ mod tests {
         assert!("gleaner_host=loud".parse::<Targets>().is_err());
     }
 
-    /// A pipe with room for some bytes.
     struct NarrowPipe {
         text: Vec<u8>,
         room: usize,

@@ -14,7 +14,6 @@ static SMALL: AtomicU64 = AtomicU64::new(0);
 /// Peak of the small blocks: the allocator keeps the memory of freed ones.
 static SMALL_PEAK: AtomicU64 = AtomicU64::new(0);
 
-/// Counts an allocated block of `bytes`.
 pub fn allocated(bytes: usize) {
     let size = block_bytes(bytes);
     if bytes >= LARGE_BYTES {
@@ -30,7 +29,6 @@ pub fn allocated(bytes: usize) {
     }
 }
 
-/// Counts a freed block of `bytes`.
 pub fn freed(bytes: usize) {
     let counter = if bytes >= LARGE_BYTES { &LARGE } else { &SMALL };
     counter.fetch_sub(block_bytes(bytes), Relaxed);

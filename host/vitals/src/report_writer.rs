@@ -18,7 +18,6 @@ const WAITING: usize = 256;
 /// Time to wait at the end for a starter that does not read.
 const END_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// The thread that writes reports.
 pub struct ReportWriter<T> {
     reports: SyncSender<T>,
     /// Nothing is sent over it; it closes when the thread has ended.
@@ -48,7 +47,6 @@ impl<T: Serialize + Send + 'static> ReportWriter<T> {
         Ok(Self { reports, ended })
     }
 
-    /// Returns a queue to the thread.
     pub fn sender(&self) -> ReportSender<T> {
         ReportSender { reports: self.reports.clone(), dropped: AtomicU64::new(0) }
     }

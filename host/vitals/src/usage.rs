@@ -33,7 +33,6 @@ pub fn cpu_seconds() -> f64 {
 pub struct ProcessUsage {
     /// Set if the process is stopped by a signal.
     pub is_stopped: bool,
-    /// Number of threads.
     pub threads: u64,
     /// Private memory: pages in RAM or swapped out, and page tables, in bytes. Pages of files and
     /// shared memory are not counted: a lambda can create none, and that of its topics exists once.

@@ -9,16 +9,13 @@ use super::ByteSize;
 /// The range and the default of a number in a manifest.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Bounds<T> {
-    /// The smallest accepted value.
     pub min: T,
     /// The value of a manifest that does not name the key.
     pub default: T,
-    /// The largest accepted value.
     pub max: T,
 }
 
 impl<T: Copy> Bounds<T> {
-    /// Returns the range of accepted values.
     pub fn range(&self) -> RangeInclusive<T> {
         self.min..=self.max
     }

@@ -9,7 +9,6 @@ use super::bounds::INPUTS_MEMORY_MAX;
 use gleaner_base::text::list;
 use gleaner_base::{Exit, Explain, NotPlain};
 
-/// The location of a key in a manifest.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct KeyLocation {
     /// The path of the manifest, as given.
@@ -26,196 +25,78 @@ impl fmt::Display for KeyLocation {
     }
 }
 
-/// The memory of one input.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct InputMemory {
-    /// The input's name.
     pub name: String,
-    /// The line of its entry.
     pub line: usize,
     /// Memory of its slots.
     pub required: ByteSize,
 }
 
-/// The reason why a manifest is refused.
 #[derive(Debug, thiserror::Error)]
 pub enum ManifestError {
-    /// The file cannot be read, or is not UTF-8.
     #[error("cannot read `{}`", path.display())]
-    Read {
-        /// The manifest.
-        path: PathBuf,
-        /// The cause.
-        source: io::Error,
-    },
-    /// The file is too long for a manifest.
+    Read { path: PathBuf, source: io::Error },
     #[error("`{}` is longer than {limit}", path.display())]
-    TooLong {
-        /// The manifest.
-        path: PathBuf,
-        /// The maximum length.
-        limit: ByteSize,
-    },
-    /// The text is not TOML.
+    TooLong { path: PathBuf, limit: ByteSize },
     #[error("{file}, line {line}: invalid TOML: {message}")]
-    Syntax {
-        /// The path of the manifest, as given.
-        file: String,
-        /// The line of the error.
-        line: usize,
-        /// The message of the parser.
-        message: String,
-    },
-    /// A required table is missing.
+    Syntax { file: String, line: usize, message: String },
     #[error("{file} has no [{table}] table")]
-    MissingTable {
-        /// The path of the manifest, as given.
-        file: String,
-        /// The table's name.
-        table: &'static str,
-        /// An example.
-        example: &'static str,
-    },
-    /// A required key is missing.
+    MissingTable { file: String, table: &'static str, example: &'static str },
     #[error("{file}, line {line}: {table} has no `{key}`")]
     MissingKey {
-        /// The path of the manifest, as given.
         file: String,
-        /// The line of the table.
         line: usize,
         /// The header of the table, for example `[lambda]`.
         table: String,
-        /// The key.
         key: &'static str,
-        /// An example.
         example: &'static str,
     },
-    /// The key is unknown.
     #[error("{file}, line {line}: unknown key `{key}` {within}")]
     UnknownKey {
-        /// The path of the manifest, as given.
         file: String,
-        /// The line of the key.
         line: usize,
-        /// The key.
         key: String,
         /// Table of the key, for example `in [schedule]`.
         within: String,
-        /// A known key that is similar.
         near: Option<&'static str>,
-        /// All known keys of that table.
         known: &'static [&'static str],
     },
-    /// A value has the wrong TOML type.
     #[error("{at} is {found}")]
-    WrongType {
-        /// The key.
-        at: Box<KeyLocation>,
-        /// Type of the value.
-        found: &'static str,
-        /// The expected value.
-        wanted: String,
-    },
-    /// A text has the wrong form.
+    WrongType { at: Box<KeyLocation>, found: &'static str, wanted: String },
     #[error("{at} is `{text}`, which is not a {what}")]
-    WrongForm {
-        /// The key.
-        at: Box<KeyLocation>,
-        /// Value of the key.
-        text: String,
-        /// The expected kind of text.
-        what: &'static str,
-        /// The form of such a text.
-        rule: &'static str,
-    },
-    /// A text is not one of the possible words.
+    WrongForm { at: Box<KeyLocation>, text: String, what: &'static str, rule: &'static str },
     #[error("{at} is `{text}`, not {}", list(choices, "or"))]
     NoChoice {
-        /// The key.
         at: Box<KeyLocation>,
-        /// Value of the key.
         text: String,
-        /// The words.
         choices: Vec<&'static str>,
-        /// A word that is similar.
         near: Option<&'static str>,
     },
-    /// A number is too small.
     #[error("{at} is {value}, below the minimum of {min}")]
-    TooSmall {
-        /// The key.
-        at: Box<KeyLocation>,
-        /// Value of the key.
-        value: String,
-        /// The smallest value.
-        min: String,
-        /// The largest value, if there is one.
-        max: Option<String>,
-    },
-    /// A number is too large.
+    TooSmall { at: Box<KeyLocation>, value: String, min: String, max: Option<String> },
     #[error("{at} is {value}, above the maximum of {max}")]
-    TooLarge {
-        /// The key.
-        at: Box<KeyLocation>,
-        /// Value of the key.
-        value: String,
-        /// The smallest value, if there is one.
-        min: Option<String>,
-        /// The largest value.
-        max: String,
-    },
-    /// Something is listed twice.
+    TooLarge { at: Box<KeyLocation>, value: String, min: Option<String>, max: String },
     #[error("{what} `{name}` is listed twice in {file}, lines {first} and {second}")]
     Twice {
         /// `topic`, `input`, `key` or the like.
         what: &'static str,
-        /// Name, topic or key that is listed twice.
         name: String,
-        /// The path of the manifest, as given.
         file: String,
-        /// The first line.
         first: usize,
-        /// The second line.
         second: usize,
-        /// Help for the user.
         help: &'static str,
     },
-    /// The schedule names an input that does not exist.
     #[error("{at} is `{name}`, which is not the name of an input")]
-    NoSuchInput {
-        /// The key.
-        at: Box<KeyLocation>,
-        /// The name.
-        name: String,
-        /// An input with a similar name.
-        near: Option<String>,
-        /// The inputs.
-        inputs: Vec<String>,
-    },
-    /// The inputs need too much memory together.
+    NoSuchInput { at: Box<KeyLocation>, name: String, near: Option<String>, inputs: Vec<String> },
     #[error(
         "the inputs in {file} need {} MiB together, above the maximum of {INPUTS_MEMORY_MAX}: {}",
         mebibytes(*total),
         shares(inputs)
     )]
-    TooMuchMemory {
-        /// The path of the manifest, as given.
-        file: String,
-        /// The memory of all inputs.
-        total: ByteSize,
-        /// The memory of each input.
-        inputs: Vec<InputMemory>,
-    },
-    /// A key conflicts with others.
+    TooMuchMemory { file: String, total: ByteSize, inputs: Vec<InputMemory> },
     #[error("{at} {why}")]
-    Misplaced {
-        /// The key.
-        at: Box<KeyLocation>,
-        /// The conflict.
-        why: String,
-        /// Help for the user.
-        help: String,
-    },
+    Misplaced { at: Box<KeyLocation>, why: String, help: String },
 }
 
 impl Explain for ManifestError {

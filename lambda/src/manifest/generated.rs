@@ -16,7 +16,6 @@ pub struct Generated {
     text: fn(&str) -> Result<String, String>,
 }
 
-/// All generated files.
 pub const GENERATED: &[Generated] = &[
     Generated { path: "docs/manifest.md", text: |_| Ok(reference()) },
     Generated { path: "docs/limits.md", text: page },

@@ -40,18 +40,14 @@ macro_rules! limits {
         }
 
         impl Limits {
-            /// Every limit at its minimum.
             pub const MIN: Limits = Limits { $($key: Bounds::<$unit> { $($bounds)+ }.min),+ };
-            /// Every limit at its default.
             pub const DEFAULT: Limits =
                 Limits { $($key: Bounds::<$unit> { $($bounds)+ }.default),+ };
-            /// Every limit at its maximum.
             pub const MAX: Limits = Limits { $($key: Bounds::<$unit> { $($bounds)+ }.max),+ };
 
             /// The keys, in the order of the table.
             pub(super) const KEYS: &[&str] = &[$(stringify!($key)),+];
 
-            /// Returns the table itself.
             pub(super) fn table() -> [Limit; Limits::KEYS.len()] {
                 [$(Limit::new(
                     stringify!($key),
@@ -178,7 +174,6 @@ limits! {
 /// A limit that a vehicle reduced.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Tightened {
-    /// Key of the limit.
     pub key: &'static str,
     /// The value in the manifest.
     pub from: String,

@@ -46,7 +46,6 @@ use gleaner_base::{NotPlain, PlainFile};
 
 use crate::Vehicle;
 
-/// Name of the manifest file.
 pub const MANIFEST_FILE: &str = "lambda.toml";
 
 impl Manifest {

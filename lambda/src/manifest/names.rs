@@ -15,7 +15,6 @@ use gleaner_base::{Exit, Explain};
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("`{text}` is not a {what}")]
 pub struct NameError {
-    /// The refused text.
     pub text: String,
     /// The expected kind of name, for example `topic name`.
     pub what: &'static str,
@@ -40,7 +39,6 @@ macro_rules! checked_text {
         pub struct $name(String);
 
         impl $name {
-            /// Returns the text.
             pub fn as_str(&self) -> &str {
                 &self.0
             }
@@ -158,7 +156,6 @@ checked_text! {
 }
 
 impl RelativePath {
-    /// Returns the path, to be joined to its folder.
     pub fn as_path(&self) -> &Path {
         Path::new(&self.0)
     }

@@ -73,7 +73,6 @@ dark_luma = { default = 50.0, min = 0, max = 255, description = "mean grey below
 <!-- `cargo xtask bless` writes this page from the types in `lambda/src/manifest`. -->
 "##;
 
-/// A table of the manifest.
 pub(super) struct Section {
     /// Header of the table, such as `[lambda]`.
     pub(super) title: &'static str,

@@ -1,20 +1,5 @@
 //! The API of the vehicle: HTTP on a socket that only this user and its group can open.
-//!
-//! | request | answer |
-//! |---|---|
-//! | `GET /v1/status` | [`VehicleStatus`] |
-//! | `POST /v1/deployments` | [`DeployReply`], of a [`DeployRequest`] |
-//! | `PUT /v1/objects/SHA256` | nothing, of a file that a deployment needs |
-//! | `GET /v1/deployments/ID/envelopes` | [`DeploymentEnvelopes`] |
-//! | `DELETE /v1/deployments/ID` | nothing, once it is removed |
-//! | `POST /v1/deployments/ID/start`, `stop`, `rollback` | [`Changed`] |
-//! | `PUT /v1/trust` | nothing, of a trust root's envelope |
-//! | `PUT /v1/cloud` | nothing, of an enrolment |
-//! | `DELETE /v1/cloud` | nothing, once it is ended; with `?new_identity=true`, also the key |
-//! | `GET /v1/events`, `GET /v1/lambdas/ID/records` | a [`StreamLine`] per line |
-//! | `GET /metrics` | counts for Prometheus |
-//!
-//! [`StreamLine`]: gleaner_protocol::vehicle_api::StreamLine
+//! [`endpoints`] lists the requests, and `docs/api/vehicle.json` describes them.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -22,16 +7,20 @@ use std::time::Instant;
 use axum::Router;
 use axum::body::{Body, Bytes};
 use axum::extract::{DefaultBodyLimit, Path, Query, State};
-use axum::http::{StatusCode, header};
+use axum::http::{Method, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{delete, get, post, put};
 use gleaner_base::{Exit, Failure};
+use gleaner_fleet::Enrolment;
+use gleaner_fleet::openapi::Endpoint;
 use gleaner_lambda::manifest::{ItemName, Sha256};
 use gleaner_protocol::vehicle_api::{
-    Changed, DeployReply, DeployRequest, DeploymentEnvelopes, Problem, ProgramStatus, VehicleStatus,
+    Changed, DeployReply, DeployRequest, DeploymentEnvelopes, Problem, ProgramStatus, StreamLine,
+    VehicleStatus,
 };
 use gleaner_trust::{PublicKey, VehicleName};
 use gleaner_vitals::usage;
+use schemars::JsonSchema;
 use serde::Deserialize;
 
 use crate::cloud::Cloud;
@@ -48,7 +37,6 @@ const BODY_MAX: usize = 12 << 20;
 /// The users of the socket, in events.
 const USER: &str = "a user";
 
-/// State of the handlers.
 #[derive(Clone)]
 pub(crate) struct Api {
     pub(crate) core: Arc<Core>,
@@ -60,7 +48,7 @@ pub(crate) struct Api {
 }
 
 /// Choice of the records of a stream.
-#[derive(Debug, Deserialize)]
+#[derive(Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct StreamQuery {
     /// Number of the first record; without one, the oldest that is kept.
@@ -73,7 +61,7 @@ pub(crate) struct StreamQuery {
 }
 
 /// Choice of what ends with an enrolment.
-#[derive(Debug, Deserialize)]
+#[derive(Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 struct LeaveQuery {
     /// True if the key of the vehicle, which signs its clips, is removed, too.
@@ -83,20 +71,43 @@ struct LeaveQuery {
 
 type Reply<T> = Result<T, ApiError>;
 
+/// Returns every request that the API answers.
+fn endpoints() -> Vec<Endpoint<Api>> {
+    let read = |path, what, handler| Endpoint::new(Method::GET, path, None, what, handler);
+    let send = |path, what, handler| Endpoint::new(Method::POST, path, None, what, handler);
+    let set = |path, what, handler| Endpoint::new(Method::PUT, path, None, what, handler);
+    let end = |path, what, handler| Endpoint::new(Method::DELETE, path, None, what, handler);
+    vec![
+        read("/v1/status", "The status of the vehicle", get(status)).gives::<VehicleStatus>(),
+        send("/v1/deployments", "Stores a deployment", post(deploy))
+            .takes::<DeployRequest>()
+            .gives::<DeployReply>(),
+        set("/v1/objects/{sha256}", "Stores a file that a deployment needs", put(object))
+            .takes_file(),
+        end("/v1/deployments/{id}", "Removes a deployment", delete(remove)),
+        read("/v1/deployments/{id}/envelopes", "The signed parts of a deployment", get(envelopes))
+            .gives::<DeploymentEnvelopes>(),
+        send("/v1/deployments/{id}/{change}", "Starts, stops or rolls back", post(change))
+            .gives::<Changed>(),
+        set("/v1/trust", "Installs the envelope of a trust root", put(trust)).takes_file(),
+        set("/v1/cloud", "Enrols the vehicle at a cloud", put(enrol)).takes::<Enrolment>(),
+        end("/v1/cloud", "Ends the enrolment", delete(leave)).query::<LeaveQuery>(),
+        read("/v1/events", "Events of the vehicle", get(events))
+            .query::<StreamQuery>()
+            .gives_lines::<StreamLine>(),
+        read("/v1/lambdas/{id}/records", "Records of a deployment", get(records))
+            .query::<StreamQuery>()
+            .gives_lines::<StreamLine>(),
+        read("/metrics", "Counts for Prometheus", get(prometheus)).gives_file("text/plain"),
+    ]
+}
+
 impl Api {
     pub(crate) fn router(self) -> Router {
-        Router::new()
-            .route("/v1/status", get(status))
-            .route("/v1/deployments", post(deploy))
-            .route("/v1/objects/{sha256}", put(object))
-            .route("/v1/deployments/{id}", delete(remove))
-            .route("/v1/deployments/{id}/envelopes", get(envelopes))
-            .route("/v1/deployments/{id}/{change}", post(change))
-            .route("/v1/trust", put(trust))
-            .route("/v1/cloud", put(enrol).delete(leave))
-            .route("/v1/events", get(events))
-            .route("/v1/lambdas/{id}/records", get(records))
-            .route("/metrics", get(prometheus))
+        let router = Router::new();
+        endpoints()
+            .into_iter()
+            .fold(router, |router, it| router.route(it.path, it.handler))
             .fallback(async || problem("there is nothing under this path"))
             .layer(DefaultBodyLimit::max(BODY_MAX))
             .with_state(self)

@@ -11,7 +11,6 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use sha2::{Digest, Sha256};
 
-/// Maximum length of such a file.
 const MAX: ByteSize = ByteSize::mib(16);
 
 /// A file with a value of type `T`.

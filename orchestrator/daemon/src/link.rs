@@ -50,9 +50,7 @@ pub(crate) struct SupervisorLink {
     pub(crate) core: Arc<Core>,
     pub(crate) layout: VehicleFolders,
     pub(crate) spec: SupervisionSpec,
-    /// The wanted state.
     pub(crate) desired: watch::Receiver<DesiredState>,
-    /// Set to end the supervisor.
     pub(crate) stop: watch::Receiver<bool>,
 }
 
@@ -61,7 +59,6 @@ enum LinkEnd {
     Stopped,
     /// It must be started again, for this reason: it runs with other settings.
     Outdated(String),
-    /// The connection is lost, for this reason.
     Lost(String),
     /// It has not reported for [`SILENCE`].
     Silent,

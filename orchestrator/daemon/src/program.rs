@@ -63,7 +63,6 @@ const WATCHDOG_INTERVAL: Duration = Duration::from_secs(3);
 const CONTROL_MAX: usize = 256;
 const METRICS_MAX: usize = 64;
 
-/// The end of the program.
 enum ProgramEnd {
     /// The end by SIGTERM: all lambdas have ended.
     Stopped,
@@ -71,7 +70,6 @@ enum ProgramEnd {
     Restart,
 }
 
-/// Runs the program.
 pub fn main() -> ExitCode {
     let args = Args::parse();
     log::init_service();

@@ -9,7 +9,6 @@ use serde::{Deserialize, Serialize};
 /// Maximum number of revisions of a deployment that are kept, beside those that it names.
 const HISTORY_MAX: usize = 2;
 
-/// All deployments.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct VehicleState {
@@ -18,7 +17,6 @@ pub(crate) struct VehicleState {
     /// Floors: written together with the deployments, so that a kill in between leaves
     /// neither without the other.
     pub(crate) floors: Floors,
-    /// The deployments, by id.
     pub(crate) deployments: BTreeMap<ItemName, Deployed>,
     /// Deployments that were removed and whose records are kept, the newest last.
     #[serde(default)]
@@ -28,13 +26,11 @@ pub(crate) struct VehicleState {
     pub(crate) followed: FollowedState,
 }
 
-/// A state of a cloud.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct FollowedState {
     /// SHA-256 of the certificate of the cloud's authority: another cloud counts on its own.
     pub(crate) authority: String,
-    /// Its number.
     pub(crate) generation: u64,
 }
 
@@ -63,7 +59,6 @@ pub(crate) struct Deployed {
     pub(crate) attempt: u64,
     /// False if a user has stopped it.
     pub(crate) is_wanted: bool,
-    /// True if its fallback runs.
     pub(crate) runs_fallback: bool,
     /// True once its revision ran for the whole probation.
     pub(crate) is_proven: bool,

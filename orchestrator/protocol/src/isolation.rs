@@ -21,7 +21,7 @@ pub const REQUIRED_LAYERS: [&str; 4] =
     ["system calls", "sockets", "real-time priority", NEEDED_CALLS];
 
 /// A layer of isolation around a lambda's process, as tested on this machine.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct Layer {
     /// The protected resource, in a word or two: `files`, `processes`.
     pub name: String,
@@ -32,7 +32,7 @@ pub struct Layer {
 }
 
 /// The result of testing a layer of isolation.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Holds {
     /// The layer was tested, and holds.

@@ -4,6 +4,8 @@
 //! Nothing here runs a lambda or listens on a socket. Programs share these types; they never link
 //! each other.
 
+#![warn(missing_docs)]
+
 mod check_report;
 mod drive_info;
 mod drive_time;

@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::link::RecorderStatus;
@@ -9,13 +10,14 @@ use gleaner_lambda::manifest::LambdaKind;
 
 /// The status of a live lambda. Counts are since its start; durations are since the previous
 /// report, and in the last report since the start.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct LiveStatus {
     /// Name of the lambda.
     pub lambda: String,
     /// Version of the lambda.
     pub version: String,
     /// Kind of the lambda.
+    #[schemars(with = "String")]
     pub kind: LambdaKind,
     /// The folder of its results.
     pub out: PathBuf,
@@ -76,7 +78,7 @@ pub struct LiveStatus {
 }
 
 /// Numbers of wakes of a lambda, in some time.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct WakeCounts {
     /// Number of wakes.
     pub wakes: u64,
@@ -196,7 +198,7 @@ pub(crate) fn add<const N: usize>(counts: [(&mut u64, u64); N]) {
 }
 
 /// Statistics of durations.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct DurationStats {
     /// Number of durations.
     pub n: u64,
@@ -209,7 +211,7 @@ pub struct DurationStats {
 }
 
 /// The samples of one input: received and lost.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct LiveTopic {
     /// Name of the input.
     pub name: String,
@@ -245,7 +247,7 @@ pub struct LiveTopic {
 }
 
 /// The network status of the ingress.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct NetworkStatus {
     /// DDS domain.
     pub domain: u16,
@@ -272,7 +274,7 @@ pub struct NetworkStatus {
 /// Times in which a process received no samples, as the ingress had ended. Samples that were sent
 /// meanwhile are among the lost ones of their topics; where their number is unknown, the number of
 /// lost ones is.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct ReceptionGaps {
     /// Number of ingresses that ended while the process ran.
     pub count: u64,
@@ -282,7 +284,7 @@ pub struct ReceptionGaps {
 }
 
 /// Losses on the link from a lambda to the recorder.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct LinkLosses {
     /// Number of wakes without a trigger that were dropped because the recorder was too slow, or
     /// there was none for a minute: clips state how many they lack.

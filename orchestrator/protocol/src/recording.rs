@@ -1,5 +1,6 @@
 //! The counts of a recorder: clips, windows, and missing data by cause.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use gleaner_base::grouped;
@@ -16,7 +17,7 @@ macro_rules! recording {
         ///
         /// They are part of a replay's summary, and of the reports of a live recorder. Counts that
         /// an older file lacks are 0.
-        #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+        #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
         #[serde(default)]
         pub struct RecordingCounts {
             $($(#[doc = $meaning])+ pub $key: u64,)+

@@ -15,8 +15,7 @@ mod order;
 pub const API_SOCKET: &str = "control.sock";
 
 /// The status of a vehicle: `GET /v1/status`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct VehicleStatus {
     /// Name of the vehicle.
     pub vehicle: String,
@@ -46,7 +45,6 @@ pub struct VehicleStatus {
     #[serde(default)]
     pub records_lost: Vec<StreamLoss>,
     /// The processes; absent while the supervisor cannot be reached.
-    #[cfg_attr(feature = "schema", schemars(with = "Option<serde_json::Value>"))]
     pub supervisor: Option<SupervisorStatus>,
     /// The connection to the cloud; absent unless the vehicle is enrolled.
     #[serde(default)]
@@ -62,8 +60,7 @@ fn number<'de, D: Deserializer<'de>>(from: D) -> Result<Option<f64>, D::Error> {
 }
 
 /// The connection of a vehicle to the cloud.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct CloudStatus {
     /// Address of the cloud: `HOST:PORT`.
     pub address: String,
@@ -96,8 +93,7 @@ pub struct CloudStatus {
 }
 
 /// The clips of a vehicle on their way to the cloud.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct ClipsStatus {
     /// Bytes of the list of clips that the cloud does not have yet; absent while it is unknown.
     pub unannounced_bytes: Option<u64>,
@@ -113,8 +109,7 @@ pub struct ClipsStatus {
 }
 
 /// A clip that makes no progress on its way to the cloud.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct StuckClip {
     /// Its name; absent if it is the list of clips that cannot be exchanged.
     pub name: Option<String>,
@@ -127,8 +122,7 @@ pub struct StuckClip {
 }
 
 /// Streams that cannot be sent for the same cause.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct FailingStreams {
     /// The cause, such as the error of the file system.
     pub cause: String,
@@ -143,8 +137,7 @@ pub struct FailingStreams {
 }
 
 /// Records of a stream that could not be written to its spool.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct StreamLoss {
     /// Name of the stream: of a lambda's records, `lambdas/ID`.
     pub stream: String,
@@ -163,8 +156,7 @@ pub struct StreamLoss {
 }
 
 /// The status of a program.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct ProgramStatus {
     /// Its version.
     pub version: String,
@@ -179,8 +171,7 @@ pub struct ProgramStatus {
 }
 
 /// The status of the trust root.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct TrustStatus {
     /// Its version.
     pub version: u64,
@@ -191,8 +182,7 @@ pub struct TrustStatus {
 }
 
 /// The status of a deployment.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct DeploymentStatus {
     /// Its id.
     pub id: String,
@@ -231,13 +221,11 @@ pub struct DeploymentStatus {
     #[serde(default)]
     pub demand: Vec<ResourceDemand>,
     /// The status of its lambda, if the supervisor knows it.
-    #[cfg_attr(feature = "schema", schemars(with = "Option<serde_json::Value>"))]
     pub status: Option<LambdaStatus>,
 }
 
 /// Rights of a lambda in a deployment.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct GrantStatus {
     /// Topics that it may read.
     pub topics: Vec<String>,
@@ -248,15 +236,14 @@ pub struct GrantStatus {
 }
 
 /// The answer to a change of a deployment.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct Changed {
     /// Number of the attempt: a status with a lower one is of an earlier one.
     pub attempt: u64,
 }
 
 /// A revision of a deployment.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct RevisionStatus {
     /// Digest of the revision.
     pub digest: String,
@@ -267,8 +254,7 @@ pub struct RevisionStatus {
 }
 
 /// A resource that lambdas share.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct Capacity {
     /// Its name: `memory`, `topics`, `cpu`, `model_time`.
     pub resource: String,
@@ -286,8 +272,7 @@ pub struct Capacity {
 }
 
 /// The demand of a deployment for a resource.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct ResourceDemand {
     /// Name of the resource, as in [`Capacity`].
     pub resource: String,
@@ -304,7 +289,7 @@ pub struct ResourceDemand {
 }
 
 /// A deployment: `POST /v1/deployments`.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct DeployRequest {
     /// The envelope of the deployment.
@@ -314,8 +299,7 @@ pub struct DeployRequest {
 }
 
 /// The signed parts of a deployment: `GET /v1/deployments/ID/envelopes`.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct DeploymentEnvelopes {
     /// The envelope of the deployment.
     pub deployment: String,
@@ -324,8 +308,7 @@ pub struct DeploymentEnvelopes {
 }
 
 /// A revision of a deployment, as it was signed.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct RevisionEnvelope {
     /// Its envelope, which has the digest of the manifest.
     pub envelope: String,
@@ -334,9 +317,8 @@ pub struct RevisionEnvelope {
 }
 
 /// The answer to a deployment.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(tag = "result", rename_all = "snake_case")]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub enum DeployReply {
     /// Files are missing: `PUT /v1/objects/SHA256` each, then repeat the request.
     Missing {
@@ -355,8 +337,7 @@ pub enum DeployReply {
 }
 
 /// A file that a vehicle needs.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct MissingObject {
     /// Its digest.
     pub sha256: String,
@@ -365,8 +346,7 @@ pub struct MissingObject {
 }
 
 /// A line of `GET /v1/events` and `GET /v1/lambdas/ID/records`.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct StreamLine {
     /// Name of the stream.
     pub stream: String,
@@ -387,8 +367,7 @@ pub struct StreamLine {
 
 /// An error, as `application/problem+json` of RFC 9457: a [`Failure`]. It has no `type`: all are of
 /// the type `about:blank`, and they differ by their status.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct Problem {
     /// The failed action.
     pub title: String,

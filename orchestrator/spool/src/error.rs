@@ -12,7 +12,6 @@ use crate::writer::BUDGET_MIN;
 /// The reason why a spool refuses a record, or cannot be used. `stream` is the name of the stream,
 /// and `first` the first sequence number of a segment.
 #[derive(Debug, thiserror::Error)]
-#[allow(missing_docs)]
 pub enum SpoolError {
     #[error("`{stream}` is not the name of a stream: it has {} bytes", stream.len())]
     Name { stream: String },
@@ -30,7 +29,6 @@ pub enum SpoolError {
         "segment {first} of stream `{stream}` has version {found}; this gleaner reads {VERSION}"
     )]
     Version { stream: String, first: u64, found: u16 },
-    /// The last segment has numbers so high that new records might get none.
     #[error("{} of stream `{stream}` leaves too few numbers", part(Some(*first)))]
     Numbers { stream: String, first: u64 },
     /// A commit failed: records from number `durable` on are not acknowledged. They stay in the

@@ -62,7 +62,6 @@ pub struct SpoolTime {
 }
 
 impl SpoolTime {
-    /// Returns the current times.
     pub fn now() -> SpoolTime {
         let boot = clock_gettime(ClockId::Boottime);
         let since_boot_ns = (boot.tv_sec as u64) * 1_000_000_000 + boot.tv_nsec as u64;
@@ -74,7 +73,6 @@ impl SpoolTime {
     }
 }
 
-/// The reason why records are missing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u8)]
 pub enum GapReason {
@@ -111,7 +109,6 @@ pub struct SpoolGap {
     pub from: u64,
     /// Last number of the range.
     pub to: u64,
-    /// The reason.
     pub reason: GapReason,
     /// Number of the gap record that the writer left; `None` if the reader found the gap.
     pub record: Option<u64>,
@@ -145,7 +142,6 @@ pub(crate) struct SegmentHeader {
     pub(crate) salt: u64,
 }
 
-/// The reason why a header cannot be used.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum HeaderFault {
     /// Incomplete or changed.

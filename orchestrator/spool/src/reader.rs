@@ -9,14 +9,11 @@ use crate::scan::SegmentScan;
 use crate::writer::TornTail;
 use crate::{SpoolError, SpoolFolder, SpoolStorage};
 
-/// A record of a stream.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct SpoolRecord {
     /// Its number in the stream.
     pub seq: u64,
-    /// The boot in which it was written.
     pub boot: BootId,
-    /// Its times.
     pub time: SpoolTime,
     /// Its kind, of the caller's choice.
     pub kind: NonZeroU8,
@@ -24,12 +21,9 @@ pub struct SpoolRecord {
     pub payload: Vec<u8>,
 }
 
-/// An item of a stream.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum SpoolItem {
-    /// A record.
     Record(SpoolRecord),
-    /// Records are missing.
     Gap(SpoolGap),
     /// The last segment ends with bytes that are not a record, since a kill or a power cut
     /// interrupted a commit, or one is in progress. The next writer replaces this by a gap record.

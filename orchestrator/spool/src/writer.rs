@@ -17,7 +17,6 @@ use crate::queue::RecordQueue;
 use crate::scan::SegmentScan;
 use crate::{SegmentFile, SpoolError, SpoolFolder, SpoolNote, SpoolStorage};
 
-/// Minimum budget of a stream.
 pub const BUDGET_MIN: ByteSize = ByteSize::kib(64);
 
 /// Space that a file system takes for a file, at least: a segment counts as a multiple of it.
@@ -26,12 +25,10 @@ const BLOCK: u64 = 4096;
 /// Maximum number of segments: bounds the time to list a folder of short ones.
 const SEGMENTS_MAX: usize = 4096;
 
-/// The settings of a stream.
 #[derive(Debug, Clone)]
 pub struct SpoolConfig {
     /// Name of the stream, 1 to [`NAME_MAX`] bytes. All segments have it.
     pub stream: String,
-    /// The current boot.
     pub boot: BootId,
     /// Maximum size of all segments, [`BUDGET_MIN`] or more. A segment has an eighth of it, at most
     /// 4 MiB; the queue has half a segment, and a payload half of that, at most [`PAYLOAD_MAX`].
@@ -43,7 +40,6 @@ pub struct SpoolConfig {
 pub struct TornTail {
     /// First number that they may contain.
     pub from: u64,
-    /// Number of bytes.
     pub bytes: u64,
 }
 
@@ -314,7 +310,6 @@ impl<S: SpoolStorage> SpoolWriter<S> {
         self.queue.len()
     }
 
-    /// Returns the counts and the state of the stream.
     pub fn status(&self) -> SpoolStatus {
         let disk_bytes = self.segments.iter().map(Segment::disk_bytes).sum();
         SpoolStatus { next: self.next, disk_bytes, ..self.counts }

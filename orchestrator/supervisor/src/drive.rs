@@ -14,7 +14,6 @@ use crate::supervised::SupervisedLambda;
 const DRAIN_TIMEOUT: Duration = Duration::from_secs(30);
 
 pub(crate) struct DriveProgress {
-    /// The files, as text.
     files: String,
     has_begun: bool,
     /// Time of the last wake after the end of the drive, and the number of wakes then.

@@ -24,7 +24,6 @@ pub(crate) struct IngressProcess {
     pub(crate) open_pipes: u8,
     /// It is ready when it has joined the network, or opened the drive.
     pub(crate) restarts: ServiceRestarts,
-    /// Set at the end of the drive.
     pub(crate) drive_ended: bool,
     has_ended: bool,
     /// Its participant, until the end of that is announced.

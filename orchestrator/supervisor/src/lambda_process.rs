@@ -24,7 +24,6 @@ pub(crate) struct LambdaProcess {
     pub(crate) open_pipes: u8,
     /// Set when the lambda has finished its `init`.
     pub(crate) is_ready: bool,
-    /// Set when the lambda has faulted.
     pub(crate) has_faulted: bool,
     /// Set when the process ended during a wake, which it could not count.
     pub(crate) has_lost_wake: bool,

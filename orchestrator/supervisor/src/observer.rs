@@ -9,16 +9,11 @@ use gleaner_protocol::link::RecorderReport;
 use crate::inference::InferenceEvent;
 use crate::spec::LambdaSpec;
 
-/// A part of a run that is started again.
 #[derive(Clone, Copy, Debug)]
 pub enum RestartedPart<'a> {
-    /// All processes.
     All,
-    /// The ingress.
     Ingress,
-    /// The recorder.
     Recorder,
-    /// The process of a lambda.
     Lambda(&'a LambdaSpec),
 }
 
@@ -27,19 +22,15 @@ pub enum RestartedPart<'a> {
 pub trait RunObserver {
     /// A report of the process of a lambda.
     fn lambda(&mut self, lambda: &LambdaSpec, report: &Report);
-    /// The process of a lambda has ended.
     fn lambda_gone(&mut self, lambda: &LambdaSpec);
     /// A deployed lambda is not started again, for this reason.
     fn quarantined(&mut self, _lambda: &LambdaSpec, _reason: &str) {}
-    /// A report of the ingress.
     fn ingress(&mut self, report: &IngressReport);
     /// The ingress has ended, and is started again.
     fn ingress_gone(&mut self);
     /// The final status of the ingress, with the topics of all ingresses of the run.
     fn ingress_ended(&mut self, status: &IngressStatus);
-    /// A report of the recorder.
     fn recorder(&mut self, report: &RecorderReport);
-    /// An event of the process that runs models.
     fn inference(&mut self, event: InferenceEvent);
     /// A drive begins: its files, as text.
     fn playing(&mut self, files: &str);

@@ -20,20 +20,24 @@ use crate::lines::{next_report, pass_on};
 /// Number of pipes of a process.
 pub(crate) const PIPES: u8 = 2;
 
-/// A process of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum ChildId {
     /// `start` counts the restarts, so that output of an earlier process is not taken for that of
     /// the current one.
-    Ingress { start: u32 },
+    Ingress {
+        start: u32,
+    },
     /// As of the ingress.
-    Recorder { start: u32 },
-    /// The process that runs models.
+    Recorder {
+        start: u32,
+    },
     Inference,
     /// This process.
     Supervisor,
     /// A process of a lambda, by its number in the group.
-    Lambda { process: u32 },
+    Lambda {
+        process: u32,
+    },
 }
 
 pub(crate) struct ChildOutput {
@@ -42,13 +46,9 @@ pub(crate) struct ChildOutput {
 }
 
 pub(crate) enum OutputPiece {
-    /// A report of the lambda's process.
     Runtime(Report),
-    /// A report of the recorder.
     Recorder(RecorderReport),
-    /// A report of the ingress.
     Ingress(IngressReport),
-    /// An event of the process that runs models.
     Inference(InferenceEvent),
     /// The start of a line on standard output that cannot be parsed.
     Unparsable(String),

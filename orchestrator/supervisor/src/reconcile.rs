@@ -14,7 +14,6 @@ pub struct KnownLambda<'a> {
 /// A step towards the wanted state.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Action {
-    /// Start this lambda.
     Start(DesiredLambda),
     /// Request the lambda with this id to end.
     Stop(String),

@@ -35,7 +35,6 @@ pub(crate) struct RecorderProcess {
     pub(crate) open_pipes: u8,
     /// It is ready when it accepts lambdas.
     pub(crate) restarts: ServiceRestarts,
-    /// Topics that lambdas record.
     pub(crate) topics: RecordedTopics,
     /// Its last status, with the counts of earlier recorders.
     pub(crate) status: Option<Box<RecorderStatus>>,

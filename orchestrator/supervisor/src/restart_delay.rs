@@ -20,7 +20,6 @@ const DELAY_KILLED_MAX: Duration = Duration::from_secs(1);
 /// Run time after which the delay is reset.
 const HEALTHY: Duration = Duration::from_secs(60);
 
-/// The delay before the next restart of something.
 #[derive(Clone, Debug)]
 pub(crate) struct RestartDelay {
     first: Duration,

@@ -24,7 +24,6 @@ pub(crate) struct CheckFailure {
 }
 
 impl CheckFailure {
-    /// Creates the failure `what`, caused by `error`.
     pub(crate) fn of(what: &str, error: &(dyn Error + 'static)) -> Self {
         Self { reason: format!("{what}: {}", chain(error)), is_shortage: is_shortage(error) }
     }

@@ -13,7 +13,6 @@ use gleaner_protocol::supervision::DesiredLambda;
 /// A run: what all its lambdas share.
 #[derive(Clone, Debug, Default)]
 pub struct RunSpec {
-    /// Folder of the clips.
     pub clips: PathBuf,
     /// Configuration file of the vehicle.
     pub vehicle: Option<PathBuf>,
@@ -41,13 +40,11 @@ pub struct RunSpec {
     pub commands: Option<String>,
     /// Free bytes of the disk below which no clip is started.
     pub disk_floor: Option<u64>,
-    /// Maximum number of clips to keep.
     pub clips_max: Option<u64>,
     /// Maximum total size of clips to keep, in bytes.
     pub bytes_max: Option<u64>,
     /// Folder of the spools of deployed lambdas, and the maximum size of each, in bytes.
     pub spool: Option<(PathBuf, u64)>,
-    /// Signature of each clip.
     pub signing: Option<ClipSigning>,
     /// Folder of cgroup v2 for the control groups of the lambdas.
     pub cgroup: Option<PathBuf>,
@@ -60,21 +57,17 @@ impl RunSpec {
     }
 }
 
-/// The signature of the clips of a run.
 #[derive(Clone, Debug)]
 pub struct ClipSigning {
     /// The open file of the key, which only the recorder reads.
     pub key: Arc<File>,
-    /// Name of the vehicle.
     pub vehicle: String,
 }
 
-/// A lambda of a run.
 #[derive(Clone, Debug)]
 pub struct LambdaSpec {
     /// Its folder, with a fresh build.
     pub folder: PathBuf,
-    /// The manifest of the build.
     pub manifest: Manifest,
     /// Its result folder.
     pub out: PathBuf,
@@ -90,7 +83,6 @@ pub struct LambdaSpec {
 }
 
 impl LambdaSpec {
-    /// Returns the name in its manifest.
     pub fn name(&self) -> &str {
         self.manifest.lambda.name.as_str()
     }

@@ -26,7 +26,6 @@ use crate::summary::{EarlierCounts, RunCounts};
 /// may have been on its way already.
 const STATUSES_AFTER_DRIVE: u32 = 2;
 
-/// A lambda, with its current process.
 pub(crate) struct SupervisedLambda {
     pub(crate) lambda: LambdaSpec,
     /// The interpreter of the environment that was made of its wheels, as checked.
@@ -367,7 +366,6 @@ impl SupervisedLambda {
         })
     }
 
-    /// Returns the number of wakes of its process.
     pub(crate) fn wakes(&self) -> u64 {
         let LambdaState::Running(process) = &self.state else { return 0 };
         process.last.as_ref().map_or(0, |live| live.wakes)

@@ -178,7 +178,6 @@ pub(crate) fn digest_text(digest: &[u8]) -> Sha256 {
     hex(digest).parse().expect("hexadecimal digits of 32 bytes")
 }
 
-/// Returns the SHA-256 of `bytes`.
 pub fn sha256(bytes: &[u8]) -> Sha256 {
     digest_text(&sha2::Sha256::digest(bytes))
 }

@@ -19,7 +19,6 @@ const MANIFEST: &str = "lambda.toml";
 
 /// The reason why the files of a build are refused or cannot be read.
 #[derive(Debug, thiserror::Error)]
-#[allow(missing_docs)]
 pub enum FileDigestError {
     #[error(transparent)]
     Layout(#[from] LayoutError),

@@ -32,11 +32,9 @@ pub struct Floors {
     lambdas: BTreeMap<LambdaName, Accepted>,
 }
 
-/// A release that was accepted.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Accepted {
-    /// Its number.
     pub release: u64,
     /// Its digest: two releases with one number differ in it.
     #[serde(deserialize_with = "bounded::text")]

@@ -239,7 +239,6 @@ impl<'de> Deserialize<'de> for PublicKey {
 
 /// The reason why a key file cannot be created or used.
 #[derive(Debug, thiserror::Error)]
-#[allow(missing_docs)]
 pub enum KeyError {
     #[error("the system has no random bytes for a key")]
     Random { source: io::Error },

@@ -36,13 +36,10 @@ pub type Labels = BTreeMap<ItemName, String>;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Revision {
-    /// Name of the lambda.
     #[serde(deserialize_with = "bounded::text")]
     pub name: LambdaName,
-    /// Version in its manifest.
     #[serde(deserialize_with = "bounded::text")]
     pub version: Version,
-    /// Kind of the lambda.
     pub kind: LambdaKind,
     /// Number of the release, 1 or more: it grows with each, and a vehicle accepts no lower one.
     pub release: u64,
@@ -53,16 +50,13 @@ pub struct Revision {
     pub files: Vec<RevisionFile>,
 }
 
-/// A file of a revision.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RevisionFile {
     /// Path in the build folder.
     #[serde(deserialize_with = "bounded::text")]
     pub path: RelativePath,
-    /// Length in bytes.
     pub bytes: u64,
-    /// Digest of its content.
     #[serde(deserialize_with = "bounded::text")]
     pub sha256: Sha256,
 }
@@ -94,7 +88,6 @@ impl Payload for Revision {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Deployment {
-    /// Name of the deployment.
     #[serde(deserialize_with = "bounded::text")]
     pub id: ItemName,
     /// Number of its release, as of a revision.
@@ -102,16 +95,13 @@ pub struct Deployment {
     /// Labels that a vehicle must have; without any, it is for all vehicles.
     #[serde(deserialize_with = "bounded::map::<_, _, _, LABELS_MAX>")]
     pub selector: Labels,
-    /// Digest of the revision.
     #[serde(deserialize_with = "bounded::text")]
     pub revision: Sha256,
     /// Digest of the revision that runs if the first one fails; it may have a lower counter.
     #[serde(deserialize_with = "bounded::text_or_null")]
     pub fallback: Option<Sha256>,
-    /// Values of the lambda's table `config`.
     #[serde(deserialize_with = "bounded::map::<_, _, _, CONFIG_MAX>")]
     pub config: BTreeMap<ItemName, ConfigValue>,
-    /// Rights of the lambda.
     pub grants: Grants,
     /// Time of signing, in seconds since 1970.
     pub created: u64,
@@ -119,7 +109,6 @@ pub struct Deployment {
     pub expires: u64,
 }
 
-/// Rights of a lambda in a deployment.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Grants {
@@ -178,7 +167,6 @@ pub struct TrustRoot {
 pub struct RootKeys {
     /// Number of these keys that must sign.
     pub threshold: usize,
-    /// The keys.
     #[serde(deserialize_with = "bounded::list::<_, _, KEYS_MAX>")]
     pub keys: Vec<PublicKey>,
 }
@@ -187,7 +175,6 @@ pub struct RootKeys {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ScopedKey {
-    /// The key.
     pub key: PublicKey,
     /// Lambdas that it may sign.
     #[serde(deserialize_with = "bounded::texts::<_, _, KEYS_MAX>")]
@@ -226,7 +213,6 @@ impl Payload for TrustRoot {
 pub struct LambdaPattern(String);
 
 impl LambdaPattern {
-    /// Returns whether it covers `name`.
     pub fn covers(&self, name: &str) -> bool {
         match self.0.strip_suffix('*') {
             Some(start) => name.starts_with(start),

@@ -25,10 +25,8 @@ use crate::{
 const LOCK_PAUSE: Duration = Duration::from_millis(50);
 const LOCK_ATTEMPTS: u32 = 600;
 
-/// A release to publish.
 #[derive(Debug)]
 pub struct Release<'a> {
-    /// The lambda's folder.
     pub lambda: &'a Path,
     /// The file to write.
     pub out: &'a Path,
@@ -39,10 +37,8 @@ pub struct Release<'a> {
     pub created: u64,
 }
 
-/// A published revision.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Published {
-    /// The revision.
     pub revision: Revision,
     /// Its digest, by which deployments name it.
     pub digest: Sha256,
@@ -167,9 +163,7 @@ fn read_existing(
     parse().map(Some).map_err(|source| ReleaseError::NoRevision { path: out.to_owned(), source })
 }
 
-/// The reason why a build is not published.
 #[derive(Debug, thiserror::Error)]
-#[allow(missing_docs)]
 pub enum ReleaseError {
     #[error(transparent)]
     Layout(#[from] LayoutError),

@@ -7,7 +7,6 @@ use crate::{Payload, TrustRoot};
 
 /// The reason why signed data is refused. Times are in seconds since 1970.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[allow(missing_docs)]
 pub enum Refusal {
     #[error("the {what} has {bytes} bytes; at most {most} are read")]
     TooLarge { what: &'static str, bytes: u64, most: ByteSize },

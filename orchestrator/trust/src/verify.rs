@@ -17,7 +17,6 @@ pub struct Trusted<P> {
 }
 
 impl<P> Trusted<P> {
-    /// Returns the payload.
     pub fn payload(&self) -> &P {
         &self.payload
     }
@@ -47,7 +46,6 @@ pub enum Verdict {
 /// The state of a vehicle by which it accepts signed data.
 #[derive(Debug, Clone, Copy)]
 pub struct Verifier<'a> {
-    /// The current trust root.
     pub root: &'a TrustRoot,
     /// Releases that were accepted before.
     pub floors: &'a Floors,

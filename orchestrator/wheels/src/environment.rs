@@ -29,7 +29,6 @@ const CONFIG: &str = "pyvenv.cfg";
 /// An environment that is as the wheels of its revision.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PreparedPython {
-    /// Its interpreter.
     pub python: PathBuf,
     /// The reason why it was made now; `None` if it was there.
     pub made: Option<String>,

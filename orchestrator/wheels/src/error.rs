@@ -13,7 +13,6 @@ use crate::archive::{FILES_MAX, UNPACKED_MAX};
 
 /// The reason why a wheel is refused, or an environment cannot be made of wheels.
 #[derive(Debug, thiserror::Error)]
-#[allow(missing_docs)]
 pub enum WheelError {
     #[error("`{name}` is not the name of a wheel")]
     Name { name: String },

@@ -44,7 +44,6 @@ impl FromStr for WheelName {
 }
 
 impl WheelName {
-    /// Returns the file name.
     pub fn as_str(&self) -> &str {
         &self.file
     }

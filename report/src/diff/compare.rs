@@ -13,9 +13,7 @@ const CHARS: usize = 300;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum DifferenceKind {
-    /// A trigger.
     Trigger,
-    /// A fault.
     Fault,
 }
 
@@ -38,9 +36,7 @@ pub struct Difference {
     pub at_ns: i64,
     /// Time of the wake, in s after the start of the first run's drive.
     pub t: f64,
-    /// A trigger or a fault.
     pub kind: DifferenceKind,
-    /// Removed, added or changed.
     pub change: ChangeKind,
     /// Topic of the sample that caused the wake; `None` for a tick.
     pub topic: Option<String>,

@@ -41,13 +41,10 @@ pub struct Diff {
     pub notes: Vec<String>,
     /// Config values that differ, of at most 200 keys.
     pub config: Vec<ValueChange>,
-    /// Counts that differ.
     pub counts: Vec<ValueChange>,
     /// Median cost of a wake, as far as the runs have it.
     pub cost: Vec<Cost>,
-    /// Counts of triggers by change.
     pub triggers: ChangeCounts,
-    /// Counts of faults by change.
     pub faults: ChangeCounts,
     /// The listed differences, in the order of their wakes.
     pub differences: Vec<Difference>,
@@ -55,16 +52,12 @@ pub struct Diff {
     pub omitted: u64,
 }
 
-/// One of the two runs.
 #[derive(Debug, Default, Serialize)]
 pub struct ComparedRun {
     /// Result folder of the run.
     pub out: String,
-    /// The name of its lambda.
     pub lambda: String,
-    /// The version of its lambda.
     pub version: String,
-    /// The kind of its lambda.
     pub kind: LambdaKind,
     /// The files of its drive; empty for a live run.
     pub drive: Vec<String>,
@@ -98,10 +91,8 @@ pub struct Cost {
     pub ratio: Option<f64>,
 }
 
-/// Numbers of triggers or faults by change.
 #[derive(Debug, Default, Clone, Copy, PartialEq, Eq, Serialize)]
 pub struct ChangeCounts {
-    /// Number of those that are identical in both runs.
     pub identical: u64,
     /// Number of those that only the first run has.
     pub removed: u64,
@@ -111,25 +102,18 @@ pub struct ChangeCounts {
     pub changed: u64,
 }
 
-/// Errors of [`Diff::between`].
 #[derive(Debug, thiserror::Error)]
 pub enum DiffError {
-    /// A folder does not hold results.
     #[error(transparent)]
     Output(#[from] OutputError),
-    /// A file of JSON lines cannot be read to its end.
     #[error(transparent)]
     Read(ResultsError),
-    /// A run has more wakes at one instant than are held in memory.
     #[error(
         "`{out}` has more than {} wakes, or more than {} MiB of them, at one instant",
         wakes::WAKES_PER_INSTANT,
         wakes::BYTES_PER_INSTANT >> 20
     )]
-    Crowded {
-        /// The folder of the run.
-        out: String,
-    },
+    Crowded { out: String },
 }
 
 impl Explain for DiffError {
@@ -227,7 +211,6 @@ impl DifferenceList {
 }
 
 impl ChangeCounts {
-    /// Returns whether nothing differs.
     pub fn is_identical(self) -> bool {
         self.removed == 0 && self.added == 0 && self.changed == 0
     }

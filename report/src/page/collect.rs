@@ -19,7 +19,6 @@ use crate::results::{JsonLines, ResultsError};
 use crate::run_summary::{OutputError, RunSummary, in_words, shown_config, signals};
 
 const CLIPS_MAX: usize = 1_000;
-/// Maximum number of log lines on a page.
 pub(super) const LOG_MAX: usize = 2_000;
 const LOG_CHARS: usize = 1_000;
 const NOTE_CHARS: usize = 1_000;

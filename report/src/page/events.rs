@@ -21,9 +21,7 @@ const CAUSES_MAX: usize = 100;
 const LABELS_MAX: usize = 24;
 const OTHER_LABELS: &str = "(other labels)";
 
-/// Maximum number of characters of a label.
 const LABEL_CHARS: usize = 120;
-/// Maximum number of characters of a fault's message.
 const MESSAGE_CHARS: usize = 2_000;
 /// Maximum size of the attributes of a trigger, in bytes of JSON.
 const ATTRIBUTE_BYTES: usize = 2_048;

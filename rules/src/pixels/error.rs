@@ -9,27 +9,17 @@ use super::{Encoding, MAX_SIDE, Roi};
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum PixelError {
-    /// An unsupported encoding.
     UnknownEncoding {
         /// The name in the message, cut to 40 characters.
         name: String,
-        /// The supported names.
         supported: String,
     },
     /// A side of the image is 0 or too long.
-    Size {
-        /// Pixels per row.
-        width: u32,
-        /// Rows.
-        height: u32,
-    },
+    Size { width: u32, height: u32 },
     /// The step is too small, so the rows would overlap.
     Step {
-        /// Pixels per row.
         width: u32,
-        /// Rows.
         height: u32,
-        /// The encoding.
         encoding: Encoding,
         /// Bytes from a row to the next, by the message.
         step: u32,
@@ -38,11 +28,8 @@ pub enum PixelError {
     },
     /// Too few bytes for the size.
     Data {
-        /// Pixels per row.
         width: u32,
-        /// Rows.
         height: u32,
-        /// The encoding.
         encoding: Encoding,
         /// Bytes from a row to the next.
         step: u32,
@@ -52,38 +39,24 @@ pub enum PixelError {
         found: usize,
     },
     /// A pixel without the neighbour that has the other half of its colour.
-    OddWidth {
-        /// Pixels per row.
-        width: u32,
-        /// The encoding.
-        encoding: Encoding,
-    },
+    OddWidth { width: u32, encoding: Encoding },
     /// A region without a pixel.
     Roi {
-        /// The region.
         roi: Roi,
         /// Pixels per row of the image.
         width: u32,
-        /// Rows of the image.
         height: u32,
     },
     /// An operation on colours of an image that is not debayered.
-    Raw {
-        /// The operation.
-        operation: &'static str,
-        /// The encoding.
-        encoding: Encoding,
-    },
+    Raw { operation: &'static str, encoding: Encoding },
     /// A size of 0, or too large a size, for the result.
     ResizeTo {
         /// Requested pixels per row.
         width: u32,
-        /// Requested rows.
         height: u32,
     },
     /// The length of the caller's slice is not that of the result.
     Output {
-        /// The operation.
         operation: &'static str,
         /// Bytes of the result.
         needed: usize,
@@ -101,12 +74,10 @@ pub enum PixelErrorKind {
     Unreadable,
     /// The requested region or size is invalid.
     OutOfRange,
-    /// The caller stopped it.
     Stopped,
 }
 
 impl PixelError {
-    /// Returns the kind.
     pub const fn kind(&self) -> PixelErrorKind {
         match self {
             Self::Roi { .. } | Self::ResizeTo { .. } => PixelErrorKind::OutOfRange,

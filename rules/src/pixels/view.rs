@@ -67,7 +67,6 @@ impl<'a> View<'a> {
         })
     }
 
-    /// Returns the same image with `stop_check` for its operations.
     #[must_use]
     pub fn with_stop_check(self, stop_check: &'a StopCheck<'a>) -> Self {
         Self { stop_check: Some(stop_check), ..self }
@@ -98,7 +97,6 @@ impl<'a> View<'a> {
         self.data
     }
 
-    /// Returns the encoding.
     pub const fn encoding(&self) -> Encoding {
         self.encoding
     }

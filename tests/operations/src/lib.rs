@@ -49,7 +49,7 @@ pub enum Price {
 }
 
 /// Base price of a call in units of fuel.
-const CALL: u64 = 20;
+pub const CALL: u64 = 20;
 
 impl Price {
     /// The two calls, with their price in units of fuel; `None` if it cannot be called.

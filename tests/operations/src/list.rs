@@ -12,7 +12,6 @@ macro_rules! operations {
         /// A function or a method of the WIT. Those that others depend on come first, so that small
         /// numbers in fuzz inputs reach them.
         #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-        #[allow(missing_docs)]
         pub enum Operation { $($operation),* }
 
         impl Operation {

@@ -14,7 +14,6 @@ pub enum DriverStep {
 /// Steps other than calls: on objects of the lambda, on its memory, and on the WASI that libraries
 /// call.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[allow(missing_docs)]
 pub enum Extra {
     Reset,
     ForgetTopic,

@@ -56,6 +56,29 @@ fn every_link_leads_to_an_existing_file_and_heading() {
 }
 
 #[test]
+fn pages_and_headings_that_comments_of_toml_files_name_exist() {
+    let mut problems = Vec::new();
+    for file in files().into_iter().filter(|file| file.is_one_of(&["toml"])) {
+        for line in file.text.lines().filter(|line| line.starts_with('#')) {
+            let Some((before, after)) = line.split_once(".md") else { continue };
+            let page = before.rsplit([' ', '(']).next().unwrap_or_default();
+            // Comments of installed files name pages of `docs`.
+            let page = page.replace("/usr/share/doc/gleaner/", "") + ".md";
+            let pages = [root().join(&page), root().join("docs").join(&page)];
+            let text = pages.iter().find_map(|page| fs::read_to_string(page).ok());
+            let heading = after.strip_prefix(", \"").and_then(|rest| rest.split('"').next());
+            let has_heading = |text: String| {
+                heading.is_none_or(|heading| text.contains(&format!("# {heading}\n")))
+            };
+            if !text.is_some_and(has_heading) {
+                problems.push(format!("{}: `{line}`: there is no such page", file.path));
+            }
+        }
+    }
+    none(problems);
+}
+
+#[test]
 fn the_book_has_every_page_once_and_its_pages_link_to_files_and_pages_of_the_book() {
     let summary = fs::read_to_string(root().join("docs/SUMMARY.md")).expect("docs/SUMMARY.md");
     let chapters: Vec<_> =
@@ -306,6 +329,27 @@ fn every_file_that_a_recipe_for_changes_names_exists() {
         }
     }
     assert!(seen > 60, "{seen} files were found");
+    none(problems);
+}
+
+#[test]
+fn each_test_that_the_specification_names_is_in_the_file_that_it_names() {
+    let page = fs::read_to_string(root().join("SPECIFICATION.md")).expect("SPECIFICATION.md");
+    let (mut text, mut seen, mut problems) = (String::new(), 0, Vec::new());
+    for (index, line) in page.lines().enumerate() {
+        if let Some((_, file)) = links(line).into_iter().find(|(_, file)| file.ends_with(".rs")) {
+            text = fs::read_to_string(root().join(file)).unwrap_or_default();
+        }
+        // Every second part between backticks is code.
+        let code = line.split('`').skip(1).step_by(2);
+        for name in code.filter(|word| word.contains('_') && !word.contains(['/', '='])) {
+            seen += 1;
+            if !text.contains(&format!("fn {name}(")) && !text.contains(&format!("\"{name}\"")) {
+                problems.push(format!("SPECIFICATION.md:{}: there is no `{name}`", index + 1));
+            }
+        }
+    }
+    assert!(seen > 20, "{seen} tests were found");
     none(problems);
 }
 

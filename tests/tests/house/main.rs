@@ -1,6 +1,7 @@
 //! The repository's structure, its pages and its language follow the rules.
 
 mod budgets;
+mod contracts;
 mod docs;
 mod packages;
 mod rooms;

@@ -89,7 +89,7 @@ impl HostComparison {
             same(native, hosted, unlike, &format!("decision {n}"));
         }
         let native_log = run.log().into_iter().map(|line| {
-            let level = format!("{:?}", line.level).to_lowercase();
+            let level = format!("{:?}", line.level).to_lowercase().replace("level::", "");
             (line.at_ns, level, line.message)
         });
         let text = |line: &serde_json::Value, key: &str| line[key].as_str().unwrap().to_owned();

@@ -25,7 +25,7 @@ const LOADER: &str = "ld-linux-aarch64.so.1";
 
 pub(crate) struct Tools {
     /// The folder above `include/` and `lib/` of the C library for aarch64.
-    libraries: PathBuf,
+    pub(super) libraries: PathBuf,
 }
 
 impl Tools {
@@ -78,33 +78,10 @@ impl Tools {
     }
 }
 
-/// Runs programs of aarch64 on this machine.
-pub(super) struct Emulator<'t> {
-    program: &'static str,
-    tools: &'t Tools,
-}
-
-impl<'t> Emulator<'t> {
-    pub(super) fn find(checkout: &Checkout, tools: &'t Tools) -> Result<Self, Failure> {
-        let program = EMULATORS.into_iter().find(|program| has(checkout, program));
-        let program = program.ok_or_else(|| missing("no emulator", &["qemu-user-static"]))?;
-        Ok(Self { program, tools })
-    }
-
-    /// Returns a shell script that runs `program`, built for aarch64, in the emulator.
-    pub(super) fn script(&self, program: &Path) -> String {
-        format!(
-            "#!/bin/sh\nexec {} -L {} {} \"$@\"\n",
-            self.program,
-            quoted(&self.tools.libraries),
-            quoted(program)
-        )
-    }
-
-    /// Returns a shell script that runs `program`, built for this machine.
-    pub(super) fn native_script(program: &Path) -> String {
-        format!("#!/bin/sh\nexec {} \"$@\"\n", quoted(program))
-    }
+/// Returns the program that runs those of aarch64 on this machine.
+pub(super) fn emulator(checkout: &Checkout) -> Result<&'static str, Failure> {
+    let program = EMULATORS.into_iter().find(|program| has(checkout, program));
+    program.ok_or_else(|| missing("no emulator", &["qemu-user-static"]))
 }
 
 fn missing(what: &str, packages: &[&str]) -> Failure {
@@ -132,21 +109,4 @@ fn libraries(checkout: &Checkout) -> Result<Option<PathBuf>, Failure> {
     // relative to its own folder.
     let loader = Path::new(loader.trim()).canonicalize().ok().filter(|loader| loader.is_file());
     Ok(loader.and_then(|loader| Some(loader.parent()?.parent()?.to_owned())))
-}
-
-fn quoted(path: &Path) -> String {
-    format!("'{}'", path.display().to_string().replace('\'', r"'\''"))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn scripts_quote_paths() {
-        let tools = Tools { libraries: "/usr/arm".into() };
-        let script =
-            Emulator { program: "emulator", tools: &tools }.script(Path::new("/it's a/program"));
-        assert_eq!(script, "#!/bin/sh\nexec emulator -L '/usr/arm' '/it'\\''s a/program' \"$@\"\n");
-    }
 }

@@ -33,17 +33,15 @@ pub(super) struct PackageMetadata {
 
 impl PackagedCommit {
     pub(crate) fn of(checkout: &Checkout) -> Self {
-        let git = |arguments: &[&str]| answer(checkout.command("git").args(arguments));
-        let release = env!("CARGO_PKG_VERSION");
+        let mut log = checkout.command("git");
+        let date = "--date=format-local:%Y%m%d%H%M%S";
+        let commit = answer(log.args(["log", "-1", "--format=%cd.%h%n%ct%n%cD", date]));
+        let mut lines = commit.iter().flat_map(|text| text.lines()).map(str::to_owned);
         // A later commit is a later version, so that `apt` upgrades to it.
-        let format = "--date=format-local:%Y%m%d%H%M%S";
-        let version = match git(&["log", "-1", "--format=%cd.%h", format]) {
-            Some(commit) => format!("{release}+{commit}"),
-            None => release.to_owned(),
-        };
-        let time = git(&["log", "-1", "--format=%ct"]).unwrap_or_else(|| "0".to_owned());
-        let date = git(&["log", "-1", "--format=%cD"])
-            .unwrap_or_else(|| "Thu, 01 Jan 1970 00:00:00 +0000".to_owned());
+        let release = env!("CARGO_PKG_VERSION");
+        let version = lines.next().map_or(release.to_owned(), |it| format!("{release}+{it}"));
+        let time = lines.next().unwrap_or_else(|| "0".to_owned());
+        let date = lines.next().unwrap_or_else(|| "Thu, 01 Jan 1970 00:00:00 +0000".to_owned());
         Self { version, time, date }
     }
 }

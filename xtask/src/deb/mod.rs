@@ -3,13 +3,17 @@
 //!
 //! `source` lists what they consist of, `tree` lays out their files, `control` writes their
 //! metadata, `licences` collects those of crates, `unit` checks the services with
-//! `systemd-analyze`, and `root` tests the packages in roots of their own. The files that are not
-//! built are in `orchestrator/package` and `cloud/package`.
+//! `systemd-analyze`, and `in-roots.sh` tests the packages in roots of their own. The files that
+//! are not built are in `orchestrator/package` and `cloud/package`.
+//!
+//! cargo-deb is not used: it takes the description of a package of cargo, leaves out libgcc and
+//! sums of files, and names libraries once for each program, for another architecture only where
+//! its packages are installed. cargo-about is not used: it leaves out notices, licences of sources
+//! in C, and each but one of the licences that a crate offers.
 
 mod control;
 mod licences;
 mod options;
-mod root;
 mod source;
 mod tree;
 mod unit;
@@ -51,7 +55,14 @@ pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, F
         let package = package(checkout, &mut steps, architecture, &programs, source)?;
         if options.test {
             steps.begin(&format!("{}: installation in a root of its own", source.name));
-            root::test(checkout, &package, &folder(checkout), source)?;
+            let mut test = checkout.command("bash");
+            test.args(["-c", include_str!("in-roots.sh"), "in-roots"]).arg(package);
+            test.arg(folder(checkout)).arg(source.folder);
+            test.args(source.has_command.then_some("lambdas"));
+            let ended = steps::run_script(&mut test)?;
+            if ended != Exit::Ok {
+                return Ok(ended);
+            }
         }
     }
     Ok(Exit::Ok)
@@ -165,29 +176,4 @@ pub(crate) fn size_mib(file: &Path) -> u64 {
 fn answer(command: &mut Command) -> Option<String> {
     let output = command.stderr(std::process::Stdio::null()).output().ok()?;
     output.status.success().then(|| String::from_utf8_lossy(&output.stdout).trim().to_owned())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn parse(arguments: &[&str]) -> Option<PackageOptions> {
-        let arguments: Vec<_> = arguments.iter().map(OsString::from).collect();
-        PackageOptions::parse(&arguments, USAGE).ok()
-    }
-
-    #[test]
-    fn the_package_is_for_this_machine_unless_another_one_is_named() {
-        let options = parse(&[]).unwrap();
-        assert_eq!(options.architecture, Architecture::of_this_machine());
-        assert_eq!((options.programs, options.test), (None, false));
-        let options = parse(&["--arch", "arm64", "--programs", "built"]).unwrap();
-        assert_eq!((options.architecture, options.test), (Architecture::Arm64, false));
-        assert_eq!(options.programs, Some("built".into()));
-        for wrong in
-            [&["--arch"][..], &["--arch", "mips"], &["--programs"], &["amd64"], &["--install"]]
-        {
-            assert_eq!(parse(wrong), None, "{wrong:?}");
-        }
-    }
 }

@@ -56,3 +56,35 @@ impl PackageOptions {
         Ok(options)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const DEB: &str = "[--arch ARCH] [--programs DIR] [--test]";
+    const DIST: &str = "[--target ARCH] [--out DIR] [--programs DIR] [--install]";
+
+    #[test]
+    fn each_command_takes_its_options() {
+        let parse = |line: &str, usage| {
+            let arguments: Vec<_> = line.split_whitespace().map(OsString::from).collect();
+            PackageOptions::parse(&arguments, usage).ok()
+        };
+        let own = parse("", DEB).unwrap();
+        assert_eq!(own.architecture, Architecture::of_this_machine());
+        assert_eq!((own.programs, own.test), (None, false));
+        let built = parse("--arch arm64 --programs built", DEB);
+        assert_eq!(built, parse("--target aarch64 --programs built", DIST));
+        let built = built.unwrap();
+        assert_eq!(built.architecture, Architecture::Arm64);
+        assert_eq!(built.programs, Some("built".into()));
+        let options = parse("--target aarch64 --out here --install", DIST).unwrap();
+        assert_eq!((options.out, options.install), (Some("here".into()), true));
+        for wrong in ["--arch", "--arch mips", "--programs", "amd64", "--install", "--out x"] {
+            assert_eq!(parse(wrong, DEB), None, "{wrong}");
+        }
+        for wrong in ["--target", "--target arm64", "--out", "aarch64", "--test"] {
+            assert_eq!(parse(wrong, DIST), None, "{wrong}");
+        }
+    }
+}

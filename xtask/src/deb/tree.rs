@@ -100,8 +100,11 @@ impl PackageTree {
     fn sdk(&self, checkout: &Checkout) -> Result<(), Failure> {
         let (sdk, lib) = (checkout.path("guest-sdk-python"), Path::new(LIB));
         self.place(&sdk.join("start.py"), &lib.join("start.py"))?;
-        for folder in ["gleaner", "gleaner/testing"] {
-            for file in entries(&sdk.join(folder))? {
+        let fleet = checkout.path("fleet-client-python");
+        for (from, folder) in
+            [(&sdk, "gleaner"), (&sdk, "gleaner/testing"), (&fleet, "gleaner_fleet")]
+        {
+            for file in entries(&from.join(folder))? {
                 let name = file.file_name().unwrap_or_default();
                 if name.to_string_lossy().ends_with(".py") || name == "py.typed" {
                     self.place(&file, &lib.join(folder).join(name))?;

@@ -144,7 +144,7 @@ fn triggers(decisions: &[Decision], start_ns: i64) -> String {
 
 /// Formats a table with columns as wide as their widest cell: text left-aligned, numbers
 /// right-aligned.
-pub(super) fn table(rows: &[[String; 6]]) -> String {
+fn table(rows: &[[String; 6]]) -> String {
     let width =
         |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
     let line = |row: &[String; 6]| {
@@ -160,20 +160,6 @@ pub(super) fn table(rows: &[[String; 6]]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn a_table_aligns_text_left_and_numbers_right() {
-        let rows = [
-            ["example", "kind", "wakes", "w/s", "MiB", "at"],
-            ["a", "python", "10", "9999", "1.0", "none"],
-        ];
-        let rows = rows.map(|row| row.map(str::to_owned));
-        assert_eq!(
-            table(&rows),
-            "example  kind    wakes   w/s  MiB  at\n\
-             a        python     10  9999  1.0  none\n"
-        );
-    }
 
     #[test]
     fn triggers_are_grouped_by_label() {

@@ -15,13 +15,12 @@ use gleaner_fleet::people::Invitation;
 use gleaner_lambda::Clip;
 use gleaner_protocol::Verified;
 use gleaner_protocol::supervision::LambdaPhase;
-use gleaner_protocol::vehicle_api::{DeploymentStatus, StreamLine, VehicleStatus};
+use gleaner_protocol::vehicle_api::{StreamLine, VehicleStatus};
 use gleaner_report::clips;
 use gleaner_report::format::{clip_contents, counted, grouped};
 use rustix::process::Signal;
 
 use super::demo_vehicle::{DemoVehicle, NAME, OUT, file, signal};
-use super::drive::table;
 use super::{arrivals, relay};
 use crate::checkout::Checkout;
 use crate::examples::{DRIVE, EXAMPLES, Example};
@@ -88,7 +87,8 @@ pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, F
         let is_idle = !recorder.is_recording && recorder.in_flight == 0;
         (is_idle && recorder.recording.clips > 0).then(|| status.clone())
     })?;
-    println!("\nthe drive has ended:\n{}", counts(&status));
+    println!("\nthe drive has ended\n$ gleaner status");
+    vehicle.show(&["status"])?;
     if let Some(id) = ids.iter().find(|id| !runs(&status, id)) {
         return Err(Failure::new(Exit::Differs, format!("`{id}` does not run at the end")));
     }
@@ -212,24 +212,6 @@ fn kill(vehicle: &DemoVehicle) -> Result<(), Failure> {
     let text = visible(event.record["text"].as_str().unwrap_or_default());
     println!("  $ gleaner {}: {text}", [&["events"], on].concat().join(" "));
     Ok(())
-}
-
-fn counts(status: &VehicleStatus) -> String {
-    let head = ["lambda", "state", "wakes", "faults", "triggers", "restarts"].map(str::to_owned);
-    let row = |deployment: &DeploymentStatus| {
-        let lambda = deployment.status.as_ref();
-        let live = lambda.and_then(|lambda| lambda.live.as_deref());
-        let count = |count: Option<u64>| count.map_or_else(|| "-".to_owned(), grouped);
-        [
-            deployment.id.clone(),
-            lambda.map_or("stopped", |lambda| lambda.phase.as_str()).to_owned(),
-            count(live.map(|live| live.wakes)),
-            count(live.map(|live| live.faults)),
-            count(live.map(|live| live.triggers)),
-            count(lambda.map(|lambda| lambda.restarts.into())),
-        ]
-    };
-    table(&std::iter::once(head).chain(status.deployments.iter().map(row)).collect::<Vec<_>>())
 }
 
 fn runs(status: &VehicleStatus, id: &str) -> bool {

@@ -16,7 +16,7 @@ use crate::steps::{self, Steps, cannot};
 use crate::{glibc, setup};
 use tarball::TARBALL;
 
-const USAGE: &str =
+pub(crate) const USAGE: &str =
     "usage: cargo xtask dist [--target aarch64|x86_64] [--out DIR] [--programs DIR] [--install]
   --target    architecture of the programs; default: that of this machine
   --out       folder for the files; default: dist/TARGET in the target folder
@@ -87,31 +87,4 @@ fn write_sums(checkout: &Checkout, out: &Path, files: &[PathBuf]) -> Result<(), 
     let text = steps::output(&mut sums, "see the error above")?;
     let path = out.join("SHA256SUMS");
     fs::write(&path, text).map_err(|error| cannot("write", &path, &error))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::architecture::Architecture;
-
-    fn parse(arguments: &[&str]) -> Option<PackageOptions> {
-        let arguments: Vec<_> = arguments.iter().map(OsString::from).collect();
-        PackageOptions::parse(&arguments, USAGE).ok()
-    }
-
-    #[test]
-    fn options_name_a_target_of_cargo() {
-        let options = parse(&["--target", "aarch64", "--out", "here", "--install"]).unwrap();
-        assert_eq!(options.architecture, Architecture::Arm64);
-        assert_eq!((options.out, options.install), (Some("here".into()), true));
-        assert_eq!(parse(&[]).unwrap().architecture, Architecture::of_this_machine());
-        let built = parse(&["--target", "x86_64", "--programs", "built"]).unwrap();
-        assert_eq!(
-            (built.architecture, built.programs),
-            (Architecture::Amd64, Some("built".into()))
-        );
-        for wrong in [&["--target"][..], &["--target", "arm64"], &["--out"], &["aarch64"]] {
-            assert_eq!(parse(wrong), None, "{wrong:?}");
-        }
-    }
 }

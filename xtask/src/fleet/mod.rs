@@ -54,15 +54,15 @@ pub(crate) fn run_scaled(checkout: &Checkout, arguments: &[OsString]) -> Result<
     let options = FleetOptions::parse(arguments).ok_or_else(|| Failure::new(Exit::Usage, USAGE))?;
     let mut steps = Steps::of(3);
     steps.begin("PostgreSQL, NATS, haproxy and an object store");
-    if options.is_installing {
-        install(checkout)?;
-    }
-    let missing = missing(checkout);
-    if !missing.is_empty() {
-        let names: Vec<_> = missing.iter().map(|(name, _)| *name).collect();
-        let message = format!("these programs are missing: {}", names.join(", "));
-        return Err(Failure::new(Exit::Unreachable, message)
-            .with_help("as root, after `apt-get update`: cargo xtask fleet --install"));
+    let missing = || missing(checkout);
+    steps::require_packages(checkout, "fleet", options.is_installing, missing)?;
+    if find(checkout, "moto_server").is_none() {
+        if !options.is_installing {
+            let message = "`moto_server`, an object store, is missing";
+            let help = "it has many packages: cargo xtask fleet --install";
+            return Err(Failure::new(Exit::Unreachable, message).with_help(help));
+        }
+        venv::apart(checkout, &checkout.target().join("fleet/venv"), &["moto[server]"])?;
     }
     steps.begin("programs (the first time this takes minutes)");
     setup::programs(checkout)?;
@@ -81,19 +81,6 @@ pub(crate) fn run_scaled(checkout: &Checkout, arguments: &[OsString]) -> Result<
     println!("ctrl-C ends it, and removes everything");
     cloud.wait(Duration::MAX);
     Ok(Exit::Ok)
-}
-
-fn install(checkout: &Checkout) -> Result<(), Failure> {
-    let missing = missing(checkout);
-    let packages: Vec<_> = missing.iter().filter_map(|(_, package)| *package).collect();
-    if !packages.is_empty() {
-        steps::install(checkout, &packages)?;
-    }
-    if find(checkout, "moto_server").is_none() {
-        // It has many packages.
-        venv::apart(checkout, &checkout.target().join("fleet/venv"), &["moto[server]"])?;
-    }
-    Ok(())
 }
 
 /// Kills one program after the other under simulated vehicles, which check that nothing is lost.

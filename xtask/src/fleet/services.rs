@@ -117,15 +117,9 @@ fn postgres() -> PathBuf {
     folders.max().unwrap_or_default()
 }
 
-/// Returns the programs that are missing, with their Debian packages; that of moto comes from pip.
-pub(super) fn missing(checkout: &Checkout) -> Vec<(&'static str, Option<&'static str>)> {
-    let mut all = [
-        ("initdb", Some("postgresql")),
-        ("nats-server", Some("nats-server")),
-        ("haproxy", Some("haproxy")),
-        ("moto_server", None),
-    ]
-    .to_vec();
-    all.retain(|(name, _)| find(checkout, name).is_none());
-    all
+/// Returns the packages of Debian whose programs are missing.
+pub(super) fn missing(checkout: &Checkout) -> Vec<&'static str> {
+    let all = [("initdb", "postgresql"), ("nats-server", "nats-server"), ("haproxy", "haproxy")];
+    let missing = all.into_iter().filter(|(name, _)| find(checkout, name).is_none());
+    missing.map(|(_, package)| package).collect()
 }

@@ -244,6 +244,7 @@ fn suites(checkout: &Checkout) -> Vec<Suite> {
         suite("loom: orders of threads in gleaner-buffers", loom, SuiteResults::Libtest),
         Suite { name: "miri: memory in gleaner-buffers".to_owned(), action: miri(checkout) },
         pytest(checkout, "Python SDK", &["guest-sdk-python/tests"]),
+        pytest(checkout, "fleet client", &["fleet-client-python/tests"]),
         // As users test lambdas, with the SDK of this checkout.
         pytest(checkout, "examples, notebooks and baselines", &["examples", "bench/baselines"]),
     ]);
@@ -252,7 +253,7 @@ fn suites(checkout: &Checkout) -> Vec<Suite> {
         mypy.args(["-m", "mypy", "--strict", "--cache-dir"])
             .arg(checkout.target().join("mypy"))
             .arg(&file)
-            .env("MYPYPATH", checkout.path("guest-sdk-python"));
+            .env("MYPYPATH", python_path(checkout));
         suite(&format!("mypy: {}", file.display()), mypy, SuiteResults::Status)
     }));
     suites
@@ -268,7 +269,7 @@ fn pytest(checkout: &Checkout, name: &str, folders: &[&str]) -> Suite {
         .args(folders)
         .env("GLEANER_EXTENSION", checkout.program("lib_gleaner.so"))
         .env("GLEANER_CLOUD_PROGRAM", checkout.program("gleaner-cloud"))
-        .env("PYTHONPATH", checkout.path("guest-sdk-python"))
+        .env("PYTHONPATH", python_path(checkout))
         .env("PYTHONDONTWRITEBYTECODE", "1");
     suite(&format!("pytest: {name}"), pytest, SuiteResults::JUnit(results))
 }
@@ -293,16 +294,24 @@ fn player_suites(checkout: &Checkout) -> Result<Vec<Suite>, Failure> {
     ])
 }
 
-/// Paths that mypy checks, relative to the checkout: the SDK, its tests, and each lambda
+/// Paths that mypy checks, relative to the checkout: the packages, their tests, and each lambda
 /// separately, since all are named `main`.
 fn typed(checkout: &Checkout) -> Vec<PathBuf> {
     let mains = checkout.lambdas(&FAMILIES).into_iter().map(|lambda| lambda.join("main.py"));
     let mains = mains.filter(|main| checkout.path(main).is_file());
-    ["guest-sdk-python/gleaner", "guest-sdk-python/tests"]
-        .map(PathBuf::from)
-        .into_iter()
-        .chain(mains)
-        .collect()
+    let packages = [
+        "guest-sdk-python/gleaner",
+        "guest-sdk-python/tests",
+        "fleet-client-python/gleaner_fleet",
+        "fleet-client-python/tests",
+    ];
+    packages.map(PathBuf::from).into_iter().chain(mains).collect()
+}
+
+/// The folders of the Python packages of this checkout.
+fn python_path(checkout: &Checkout) -> OsString {
+    let folders = ["guest-sdk-python", "fleet-client-python"].map(|it| checkout.path(it));
+    env::join_paths(folders).expect("a checkout has no `:` in its path")
 }
 
 fn miri(checkout: &Checkout) -> SuiteAction {

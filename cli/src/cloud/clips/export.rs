@@ -14,7 +14,7 @@ use super::{CLIPS, query};
 use crate::args::ExportArgs;
 use crate::cloud::{client, list, show};
 
-/// The table, in the folder of an export. `gleaner.cloud` of the Python SDK reads it.
+/// The table, in the folder of an export. `gleaner_fleet.export` in Python reads it.
 pub(super) const TABLE: &str = "events.jsonl";
 
 pub(super) fn export(args: &ExportArgs) -> Result<Exit, Failure> {

@@ -14,7 +14,6 @@ fn head(stream: &mut impl Read) -> String {
     String::from_utf8(request).unwrap()
 }
 
-/// Serves an answer that never ends, to one request.
 fn serve_without_end(mut stream: impl Read + Write, status: &str) {
     head(&mut stream);
     let head = format!("HTTP/1.1 {status}\r\ncontent-type: application/json\r\n\r\n");

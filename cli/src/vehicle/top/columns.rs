@@ -19,7 +19,6 @@ pub(super) struct Column {
     rank: u8,
 }
 
-/// All columns, from left to right.
 static COLUMNS: [Column; 15] = [
     Column { head: "id", rank: 0, cell: |it| visible(&it.id) },
     Column { head: "state", rank: 1, cell: |it| it.state.to_owned() },

@@ -58,7 +58,6 @@ pub(super) struct LambdaFigures {
     pub(super) rss_bytes: Option<u64>,
     pub(super) triggers: Option<u64>,
     pub(super) faults: Option<u64>,
-    /// Everything lost, of all causes.
     pub(super) losses: Option<u64>,
     /// Clips with its windows, since the start of the supervisor.
     pub(super) clips: Option<u64>,

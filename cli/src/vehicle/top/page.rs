@@ -24,10 +24,8 @@ const SILENCE: Duration = POLL_INTERVAL.saturating_mul(3);
 #[derive(Default)]
 pub(super) struct Page {
     polls: Polls,
-    /// The cause of a failed poll.
     failure: Option<String>,
     order: RowOrder,
-    /// Id of the selected row.
     selected: Option<String>,
     rows: TableState,
 }
@@ -54,7 +52,6 @@ impl Page {
             lambdas.get(row.min(lambdas.len().saturating_sub(1))).map(|it| it.id.clone());
     }
 
-    /// Returns the rows in their order.
     fn lambdas(&self) -> Vec<LambdaFigures> {
         let mut lambdas = self.polls.figures().lambdas;
         self.order.sort(&mut lambdas);

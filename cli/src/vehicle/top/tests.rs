@@ -165,7 +165,6 @@ fn rows_are_sorted_by_the_highest_number_and_unknown_ones_come_last() {
     assert_eq!(ids(RowOrder::Cpu), "bac");
 }
 
-/// A page with two polls of these deployments.
 fn page(deployments: impl Fn(f64) -> Vec<Value>) -> Page {
     let mut polls = Polls::default();
     for up_s in [10.0, 11.0] {

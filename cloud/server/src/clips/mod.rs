@@ -17,7 +17,7 @@ use gleaner_fleet::clips::ClipId;
 use tokio::time::interval;
 
 pub(crate) use files::{ClipFiles, FileOfClip};
-pub(crate) use vehicles::{is_thumbnail, router};
+pub(crate) use vehicles::{endpoints, is_thumbnail};
 
 use crate::cloud::Cloud;
 use crate::error::CloudResult;

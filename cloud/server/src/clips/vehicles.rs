@@ -5,9 +5,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use axum::Json;
-use axum::Router;
 use axum::body::{Body, Bytes};
 use axum::extract::{DefaultBodyLimit, Path};
+use axum::http::Method;
 use axum::middleware::from_fn;
 use axum::routing::{post, put};
 use futures_util::TryStreamExt;
@@ -16,6 +16,7 @@ use gleaner_fleet::clips::{
     CLIP_PART, CLIP_PIECE_MIN, CLIP_REPORT_MAX, CLIPS_IN_REPORT, ClipFacts, ClipId, ClipName,
     ClipOrders, ClipReport, THUMBNAIL_MAX,
 };
+use gleaner_fleet::openapi::Endpoint;
 use gleaner_image::Format;
 
 use super::remove_noted;
@@ -34,15 +35,22 @@ const NO_PARTS: &str = "its first parts are not there any more";
 /// for.
 const SIDE_MAX: u32 = 4096;
 
-/// Returns the routes, which need a certificate.
-pub(crate) fn router() -> Router<Arc<Cloud>> {
+/// Returns the requests, which need a certificate.
+pub(crate) fn endpoints() -> [Endpoint<Arc<Cloud>>; 4] {
     let report = post(report).layer(DefaultBodyLimit::max(CLIP_REPORT_MAX));
+    let report = report.layer(from_fn(in_time));
     let thumbnail = put(thumbnail).layer(DefaultBodyLimit::max(THUMBNAIL_MAX as usize));
-    Router::new()
-        .route("/v1/clips", report.layer(from_fn(in_time)))
-        .route("/v1/clips/{name}/thumbnail", thumbnail.layer(from_fn(in_time)))
-        .route("/v1/clips/{name}/from/{begin}", put(piece))
-        .route("/v1/clips/{name}/parts/{part}/{sha256}", put(part))
+    let put_file = |path, what, handler| {
+        Endpoint::new(Method::PUT, path, None, what, handler).takes_file().gives::<ClipOrders>()
+    };
+    [
+        Endpoint::new(Method::POST, "/v1/clips", None, "Announces clips", report)
+            .takes::<ClipReport>()
+            .gives::<ClipOrders>(),
+        put_file("/v1/clips/{name}/thumbnail", "Sends an image", thumbnail.layer(from_fn(in_time))),
+        put_file("/v1/clips/{name}/from/{begin}", "Sends a piece of a clip", put(piece)),
+        put_file("/v1/clips/{name}/parts/{part}/{sha256}", "Sends a part of a clip", put(part)),
+    ]
 }
 
 /// Stores a report; answers with everything that is wanted.

@@ -19,7 +19,6 @@ use crate::store::VehicleFilter;
 /// Number of users and of vehicles on a page.
 const SIZE: usize = 50;
 
-/// Roles with what they may do.
 pub(super) const ROLES: [(Role, &str); 4] = [
     (Role::Viewer, "read"),
     (Role::Operator, "also start, stop and roll back, steer waves and fetch clips"),

@@ -1,5 +1,5 @@
 //! The API for people: JSON over HTTP, each request with a token. [`endpoints`] lists the requests,
-//! and `openapi` describes them for other programs; `gleaner_fleet::people` has the messages.
+//! and `docs/api/fleet.json` describes them; `gleaner_fleet::people` has the messages.
 //!
 //! This room checks no signature and has no key: the cloud stores and forwards what was signed, and
 //! each vehicle decides by its own trust root. A deployment is only parsed, within the bounds of
@@ -7,16 +7,14 @@
 
 mod conditions;
 mod deploy;
-mod endpoint;
 mod lists;
 mod metrics;
-mod openapi;
 mod records;
 #[cfg(test)]
 pub(crate) mod tests;
 pub(crate) mod tokens;
 
-use std::sync::Arc;
+use std::sync::{Arc, LazyLock};
 
 use axum::Json;
 use axum::Router;
@@ -29,6 +27,7 @@ use axum::routing::{self, delete, get, post};
 use gleaner_fleet::Enrolment;
 use gleaner_fleet::clips::{ClipPolicy, ClipUsage, FleetClip};
 use gleaner_fleet::entrance::ClientNetwork;
+use gleaner_fleet::openapi::{Endpoint, describe};
 use gleaner_fleet::people::{
     AuditEntry, FleetDeployRequest, FleetDeployment, Invitation, ListPage, Login, NewToken,
     NewUser, NewVehicle, ReportedRelease, Role, TokenSummary, User, UserToken, VehicleSummary,
@@ -48,7 +47,6 @@ use crate::store::{ChangeAuthor, ClipQuery, TokenUser};
 use crate::transfer::OCTETS;
 
 use self::conditions::{ChangeConditions, tagged};
-use self::endpoint::Endpoint;
 use self::records::RecordQuery;
 
 /// Maximum length of a deployment without its files: one with two revisions of 4 MiB each, as
@@ -73,7 +71,7 @@ const LOGIN: &str = "use the token of a login: `gleaner login`";
 /// Returns every request that the API answers: no role is stated elsewhere, and no need of a login
 /// but that of tokens, of which one for programs removes itself only.
 #[expect(clippy::too_many_lines, reason = "a table of requests, read from top to bottom")]
-pub(crate) fn endpoints() -> Vec<Endpoint> {
+pub(crate) fn endpoints() -> Vec<Endpoint<Arc<Cloud>>> {
     use Role::{Admin, Deployer, Operator, Viewer};
     let new = Endpoint::new;
     let read = |path, role, what, handler| new(Method::GET, path, Some(role), what, handler);
@@ -83,7 +81,7 @@ pub(crate) fn endpoints() -> Vec<Endpoint> {
     let deploy = post(deploy::deploy).layer(DefaultBodyLimit::max(BODY_MAX));
     let open = |method, path, what, handler| new(method, path, None, what, handler);
     vec![
-        open(Method::GET, "/v1/openapi.json", "This description", get(openapi::document))
+        open(Method::GET, "/v1/openapi.json", "This description", get(document))
             .gives::<Map<String, Value>>(),
         open(Method::GET, "/health", "The health of the cloud", get(metrics::health))
             .gives::<Map<String, Value>>(),
@@ -303,6 +301,13 @@ async fn user(
 fn bearer(headers: &HeaderMap) -> Option<&str> {
     let header = headers.get(header::AUTHORIZATION)?.to_str().ok()?;
     header.strip_prefix("Bearer ")
+}
+
+async fn document() -> Response {
+    static DOCUMENT: LazyLock<String> = LazyLock::new(|| {
+        describe("Gleaner cloud", "The API for people of the cloud of a fleet.", &endpoints())
+    });
+    ([(header::CONTENT_TYPE, "application/json")], DOCUMENT.as_str()).into_response()
 }
 
 async fn login(

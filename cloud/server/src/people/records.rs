@@ -50,7 +50,6 @@ pub(super) struct RecordPath {
     id: Option<String>,
 }
 
-/// Reads records piece by piece.
 struct RecordReader {
     cloud: Arc<Cloud>,
     vehicle: String,
@@ -59,7 +58,6 @@ struct RecordReader {
     /// Number of the last arrival that was sent.
     arrival: i64,
     is_events: bool,
-    /// Lines to send first.
     first: Vec<String>,
     /// Lines about what was removed so far.
     removed: Vec<String>,

@@ -126,7 +126,6 @@ fn level(line: LogLine) -> RecordLevel {
     }
 }
 
-/// The conditions of a search for each record.
 struct RecordFilter<'s> {
     search: &'s RecordSearch,
     /// The text in lower case, as it is in a value and as JSON writes it.

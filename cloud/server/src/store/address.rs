@@ -55,11 +55,7 @@ impl StoreAddress {
     }
 
     /// Parses the URL of a server.
-    ///
-    /// # Errors
-    ///
-    /// A failure if it is none of PostgreSQL. It does not repeat the URL, which may have a
-    /// password.
+    /// Fails if it is none of PostgreSQL. It does not repeat the URL, which may have a password.
     pub(crate) fn server(url: &str) -> Result<Self, Failure> {
         if url.starts_with("postgres://") || url.starts_with("postgresql://") {
             return Ok(Self::Postgres(url.to_owned()));
@@ -68,7 +64,6 @@ impl StoreAddress {
             .with_help("write postgres://USER@HOST/DATABASE, with the password in PGPASSWORD"))
     }
 
-    /// Returns the statement that begins a change.
     pub(super) fn begin(&self) -> &'static str {
         match self {
             Self::Sqlite(_) => BEGIN_SQLITE,
@@ -77,10 +72,6 @@ impl StoreAddress {
     }
 
     /// Makes at most this many connections.
-    ///
-    /// # Errors
-    ///
-    /// A failure that names the cause.
     pub(super) async fn connect(&self, connections: u32) -> Result<AnyPool, Failure> {
         sqlx::install_own_drivers();
         let is_sqlite = matches!(self, Self::Sqlite(_));

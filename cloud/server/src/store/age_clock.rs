@@ -63,7 +63,7 @@ impl CloudStore {
     /// Counts the time up to `up_s` after the start of this process; returns the clock.
     pub(super) async fn count_age_at(&self, up_s: i64, wall: i64) -> CloudResult<i64> {
         let mut change = self.change().await?;
-        let row: Option<(i64, i64)> = row!(&mut *change.tx; "SELECT seconds, wall FROM age_clock");
+        let row: Option<(i64, i64)> = row!(change; "SELECT seconds, wall FROM age_clock");
         let stored = match row {
             Some(stored) => stored,
             None => change.begin_age(wall).await?,
@@ -89,8 +89,7 @@ impl CloudStore {
             }
         }
         if look.found.is_none() {
-            run!(&mut *change.tx;
-                "UPDATE age_clock SET seconds = $1, wall = $2"; look.seconds, wall);
+            run!(change; "UPDATE age_clock SET seconds = $1, wall = $2"; look.seconds, wall);
         }
         change.commit().await?;
         *self.ages.last.lock().unwrap_or_else(PoisonError::into_inner) = Some(look);
@@ -102,15 +101,14 @@ impl StoreChange<'_> {
     /// Begins the clock at the time of the machine, unless that is days after the last sign of life
     /// in the database. Notes of later days are of a clock that was wrong.
     async fn begin_age(&mut self, wall: i64) -> CloudResult<(i64, i64)> {
-        let (entry, seen): (i64, i64) = one!(&mut *self.tx;
-            "SELECT (SELECT COALESCE(MAX(time_ms), 0) / 1000 FROM audit),
-             (SELECT COALESCE(MAX(seen), 0) FROM vehicles)");
+        let (entry, seen): (i64, i64) = one!(self; "SELECT (SELECT COALESCE(MAX(time_ms), 0) / 1000
+             FROM audit), (SELECT COALESCE(MAX(seen), 0) FROM vehicles)");
         let seconds = match entry.max(seen) {
             0 => wall,
             last => wall.min(last + AWAY_MAX_S),
         };
-        run!(&mut *self.tx; "DELETE FROM arrival_days WHERE day > $1"; seconds / DAY_S);
-        run!(&mut *self.tx; "INSERT INTO age_clock (seconds, wall) VALUES ($1, $2)"; seconds, wall);
+        run!(self; "DELETE FROM arrival_days WHERE day > $1"; seconds / DAY_S);
+        run!(self; "INSERT INTO age_clock (seconds, wall) VALUES ($1, $2)"; seconds, wall);
         Ok((seconds, wall))
     }
 }

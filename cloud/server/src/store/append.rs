@@ -6,11 +6,11 @@ use gleaner_fleet::{Ack, Cursor};
 
 use super::numbers::{check_life, check_number};
 use super::records::{Retention, StreamBatch};
+use super::sql::{SqlValue, list_parts};
 use super::writer::{GroupVehicles, VehicleWrite, Waiting, WaitingWrite, counting};
-use super::{CloudStore, StoreChange, int, list_parts, parts, unsigned};
+use super::{CloudStore, StoreChange, int};
 use crate::counts::COUNTS;
 use crate::error::{CloudError, CloudResult};
-use crate::sqlx::{self, AssertSqlSafe};
 
 /// Maximum number of streams of a vehicle: two, and one for each lambda that it ever had.
 const STREAMS_MAX: i64 = 1000;
@@ -22,7 +22,6 @@ const STEP: i64 = 1000;
 
 /// A batch to store, if the connection still counts.
 pub(super) struct AppendWrite {
-    name: String,
     epoch: u64,
     batch: StreamBatch,
     retention: Retention,
@@ -39,28 +38,21 @@ struct VehicleStreams {
     count: i64,
 }
 
-struct StoredStream {
-    cursor: Cursor,
-    kept: i64,
-    kept_bytes: i64,
+typed! {
+    struct StoredStream {
+        vehicle: String,
+        cursor: Cursor,
+        kept: i64,
+        kept_bytes: i64,
+    }
 }
+
+columns!(Cursor: stream, life, next, seq, boot, boot_ns);
 
 impl VehicleWrite for AppendWrite {
     type Done = Ack;
 
     const WAITING: fn(Waiting<Self>) -> WaitingWrite = WaitingWrite::Append;
-
-    fn vehicle(&self) -> &str {
-        &self.name
-    }
-}
-
-struct NewLine<'a> {
-    vehicle: &'a str,
-    stream: &'a str,
-    life: u64,
-    arrival: i64,
-    line: &'a (u64, String, String),
 }
 
 type StreamKey<'a> = (&'a str, &'a str);
@@ -80,8 +72,8 @@ impl CloudStore {
         if batch.cursor.next == 0 {
             return Err(CloudError::usage("a batch of records ends at 0", "send its records"));
         }
-        let (name, records) = (name.to_owned(), batch.lines.len() as u64);
-        let ack = self.write(AppendWrite { name, epoch, batch, retention }).await?;
+        let records = batch.lines.len() as u64;
+        let ack = self.write(name, AppendWrite { epoch, batch, retention }).await?;
         COUNTS.records.add(records);
         Ok(ack)
     }
@@ -96,15 +88,8 @@ impl StoredStreams {
         self.0.get_mut(vehicle)?.known.get_mut(stream)
     }
 
-    fn kept_bytes(&self, keys: &BTreeMap<StreamKey<'_>, Retention>) -> Vec<i64> {
-        keys.keys().map(|key| self.get(*key).map_or(0, |stored| stored.kept_bytes)).collect()
-    }
-
     /// Returns a stream that gets records of a life; the position of an earlier one does not count.
-    ///
-    /// # Errors
-    ///
-    /// An error if the life has ended or is too large, or the vehicle has too many streams.
+    /// Fails if the life has ended or is too large, or the vehicle has too many streams.
     fn begin(&mut self, vehicle: &str, stream: &str, life: u64) -> CloudResult<&mut StoredStream> {
         let VehicleStreams { known, count } = self.0.entry(vehicle.to_owned()).or_default();
         let last = known.get(stream).map(|it| it.cursor.life);
@@ -117,11 +102,11 @@ impl StoredStreams {
         *count += i64::from(is_new);
         let stored = known.entry(stream.to_owned()).or_insert_with(|| {
             let cursor = Cursor { stream: stream.to_owned(), life, ..Cursor::default() };
-            StoredStream { cursor, kept: 0, kept_bytes: 0 }
+            StoredStream { vehicle: vehicle.to_owned(), cursor, kept: 0, kept_bytes: 0 }
         });
         if stored.cursor.life > life {
-            let message =
-                format!("stream `{stream}` has life {}; this is {life}", stored.cursor.life);
+            let known = stored.cursor.life;
+            let message = format!("stream `{stream}` has life {known}; this is {life}");
             return Err(CloudError::usage(message, "begin the next life of the stream"));
         }
         if stored.cursor.life < life {
@@ -145,40 +130,31 @@ fn moved(stored: Cursor, next: &Cursor) -> Cursor {
 }
 
 impl StoreChange<'_> {
-    /// Returns the positions of all streams of these vehicles.
     pub(super) async fn cursors_of(
         &mut self,
         vehicles: &[&String],
     ) -> CloudResult<HashMap<String, Vec<Cursor>>> {
         let mut cursors = HashMap::<_, Vec<_>>::new();
-        let rows: Vec<(String, String, i64, i64, i64, String, i64)> = rows_in!(&mut *self.tx;
-            "SELECT vehicle, stream, life, next, seq, boot, boot_ns FROM streams
-             WHERE vehicle IN () ORDER BY stream";
-            vehicles);
-        for (vehicle, stream, life, next, seq, boot, boot_ns) in rows {
-            cursors.entry(vehicle).or_default().push(Cursor {
-                stream,
-                life: unsigned(life),
-                next: unsigned(next),
-                seq: unsigned(seq),
-                boot,
-                boot_ns: unsigned(boot_ns),
-            });
+        let rows: Vec<StoredStream> = rows_in!(self;
+            "SELECT vehicle, stream, life, next, seq, boot, boot_ns, kept, kept_bytes
+             FROM streams WHERE vehicle IN ($1..) ORDER BY stream"; vehicles);
+        for StoredStream { vehicle, cursor, .. } in rows {
+            cursors.entry(vehicle).or_default().push(cursor);
         }
         Ok(cursors)
     }
 
-    /// Stores batches of connections that still count.
     pub(super) async fn append_all(
         &mut self,
         vehicles: &mut GroupVehicles,
         appends: &mut [&mut Waiting<AppendWrite>],
     ) -> CloudResult<()> {
-        let keys = appends.iter().map(|it| (&*it.write.name, &*it.write.batch.cursor.stream));
+        let keys = appends.iter().map(|it| (&*it.vehicle, &*it.write.batch.cursor.stream));
         let mut streams = self.streams_of(&keys.collect::<Vec<_>>()).await?;
-        let (mut lines, mut grown) = (Vec::new(), BTreeMap::new());
+        let (mut lines, mut others, mut grown) = (Vec::new(), 0, BTreeMap::new());
         for waiting in appends.iter_mut() {
-            let AppendWrite { name, epoch, batch, retention } = &waiting.write;
+            let AppendWrite { epoch, batch, retention } = &waiting.write;
+            let name = &waiting.vehicle;
             let Cursor { stream, life, next, .. } = &batch.cursor;
             let checked = counting(vehicles, name, int(*epoch))
                 .and_then(|vehicle| Ok((vehicle, streams.begin(name, stream, *life)?)));
@@ -192,11 +168,13 @@ impl StoreChange<'_> {
             let known = stored.cursor.next;
             // Those before the position were stored, and may have made room since.
             let is_new = |seq: u64, mark: &str| !mark.is_empty() || seq >= known;
-            for line in &batch.lines {
+            for (seq, mark, text) in &batch.lines {
                 vehicle.arrived += 1;
-                if is_new(line.0, &line.1) {
-                    let (life, arrival) = (*life, vehicle.arrived);
-                    lines.push(NewLine { vehicle: name, stream, life, arrival, line });
+                if is_new(*seq, mark) {
+                    lines.push(values! {
+                        name, stream, life, seq, mark, vehicle.arrived, text, text.len()
+                    });
+                    others += usize::from(mark.is_empty());
                 }
             }
             stored.cursor = moved(std::mem::take(&mut stored.cursor), &batch.cursor);
@@ -204,152 +182,77 @@ impl StoreChange<'_> {
             let ack = Ack { stream: stream.clone(), life: *life, next: known.max(*next) };
             waiting.result = Some(Ok(ack));
         }
-        let before = streams.kept_bytes(&grown);
-        self.insert_lines(&lines, &mut streams).await?;
+        let before = grown.keys().map(|key| streams.get(*key).map_or(0, |it| it.kept_bytes));
+        let before: Vec<_> = before.collect();
+        self.insert_lines(&lines, others, &mut streams).await?;
         let arrived: BTreeSet<_> = grown.keys().map(|(vehicle, _)| *vehicle).collect();
-        let arrived = arrived.into_iter().filter_map(|name| Some((name, vehicles.get(name)?)));
-        for part in parts(&arrived.collect::<Vec<_>>()) {
-            let sql = format!(
-                "INSERT INTO vehicles (name, arrived) VALUES {}
-                 ON CONFLICT (name) DO UPDATE SET arrived = excluded.arrived",
-                self.placeholders(part.len(), 2)
-            );
-            let query = sqlx::query(AssertSqlSafe(sql));
-            let query = part
-                .iter()
-                .fold(query, |query, (name, vehicle)| query.bind(*name).bind(vehicle.arrived));
-            query.execute(&mut *self.tx).await?;
-        }
-        self.set_streams(&grown.keys().copied().collect::<Vec<_>>(), &streams).await?;
+        let arrived = arrived.into_iter();
+        let arrived = arrived.filter_map(|it| Some(values! { it, vehicles.get(it)?.arrived }));
+        self.upsert(("vehicles", "name", "arrived"), &arrived.collect::<Vec<_>>()).await?;
+        let rows = grown.keys().filter_map(|key| {
+            let StoredStream { vehicle, cursor, kept, kept_bytes } = streams.get(*key)?;
+            let Cursor { stream, life, next, seq, boot, boot_ns } = cursor;
+            Some(values! { vehicle, stream, life, next, seq, boot, boot_ns, kept, kept_bytes })
+        });
+        let others = "life, next, seq, boot, boot_ns, kept, kept_bytes";
+        self.upsert(("streams", "vehicle, stream", others), &rows.collect::<Vec<_>>()).await?;
         self.make_room_where_due(&grown, &streams, &before).await
     }
 
     async fn streams_of(&mut self, keys: &[StreamKey<'_>]) -> CloudResult<StoredStreams> {
         let mut streams = StoredStreams::default();
-        for part in list_parts(keys) {
-            let sql = format!(
-                "SELECT vehicle, stream, life, next, seq, boot, boot_ns, kept, kept_bytes
-                 FROM streams WHERE (vehicle, stream) IN (VALUES {})",
-                self.placeholders(part.len(), 2)
-            );
-            type Row = (String, String, i64, i64, i64, String, i64, i64, i64);
-            let query = sqlx::query_as::<_, Row>(AssertSqlSafe(sql));
-            let query =
-                part.iter().fold(query, |query, (name, stream)| query.bind(*name).bind(*stream));
-            let rows = query.fetch_all(&mut *self.tx).await?;
-            for (vehicle, stream, life, next, seq, boot, boot_ns, kept, kept_bytes) in rows {
-                let cursor = Cursor {
-                    stream: stream.clone(),
-                    life: unsigned(life),
-                    next: unsigned(next),
-                    seq: unsigned(seq),
-                    boot,
-                    boot_ns: unsigned(boot_ns),
-                };
-                let stored = StoredStream { cursor, kept, kept_bytes };
-                streams.0.entry(vehicle).or_default().known.insert(stream, stored);
+        let keys_of: Vec<_> = keys.iter().map(|key| values! { key.0, key.1 }).collect();
+        for part in list_parts(&keys_of) {
+            let sql = "SELECT vehicle, stream, life, next, seq, boot, boot_ns, kept, kept_bytes
+                       FROM streams WHERE (vehicle, stream) IN (VALUES ())";
+            let rows: Vec<StoredStream> = self.with_values(sql, &part).await?;
+            for stored in rows {
+                let known = &mut streams.0.entry(stored.vehicle.clone()).or_default().known;
+                known.insert(stored.cursor.stream.clone(), stored);
             }
         }
         // Vehicles with a stream that is new.
-        let mut names: Vec<_> = keys
-            .iter()
-            .filter(|(vehicle, stream)| streams.get((vehicle, stream)).is_none())
-            .map(|(vehicle, _)| *vehicle)
-            .collect();
-        names.sort_unstable();
-        names.dedup();
-        let counts: Vec<(String, i64)> = rows_in!(&mut *self.tx;
-            "SELECT vehicle, COUNT(*) FROM streams WHERE vehicle IN () AND next > 0
-             GROUP BY vehicle";
-            &names);
+        let new = keys.iter().filter(|key| streams.get(**key).is_none());
+        let names: BTreeSet<_> = new.map(|(vehicle, _)| *vehicle).collect();
+        let names: Vec<_> = names.into_iter().collect();
+        let counts: Vec<(String, i64)> = rows_in!(self; "SELECT vehicle, COUNT(*)
+             FROM streams WHERE vehicle IN ($1..) AND next > 0 GROUP BY vehicle"; &names);
         for (vehicle, count) in counts {
             streams.0.entry(vehicle).or_default().count = count;
         }
         Ok(streams)
     }
 
-    /// Inserts lines with their arrivals, and adds those that were not there already to their
-    /// streams.
-    ///
-    /// # Errors
-    ///
-    /// An error if a record has the number of another one: it would be acknowledged and lost. No
+    /// Inserts lines with their arrivals, of which `others` have no mark, and adds those that were
+    /// not there already to their streams.
+    /// Fails if a record has the number of another one: it would be acknowledged and lost. No
     /// vehicle sends it, as records before the position are left out.
     async fn insert_lines(
         &mut self,
-        lines: &[NewLine<'_>],
+        lines: &[[SqlValue<'_>; 8]],
+        mut others: usize,
         streams: &mut StoredStreams,
     ) -> CloudResult<()> {
-        for part in parts(lines) {
-            let sql = format!(
+        let inserted: Vec<(String, String, String, i64)> = self
+            .insert(
                 "INSERT INTO records (vehicle, stream, life, seq, mark, arrival, line, bytes)
-                 VALUES {} ON CONFLICT (vehicle, stream, life, seq, mark) DO NOTHING
+                 VALUES () ON CONFLICT (vehicle, stream, life, seq, mark) DO NOTHING
                  RETURNING vehicle, stream, mark, bytes",
-                self.placeholders(part.len(), 8)
-            );
-            let mut query = sqlx::query_as::<_, (String, String, String, i64)>(AssertSqlSafe(sql));
-            for NewLine { vehicle, stream, life, arrival, line: (seq, mark, line) } in part {
-                query = query
-                    .bind(*vehicle)
-                    .bind(*stream)
-                    .bind(int(*life))
-                    .bind(int(*seq))
-                    .bind(mark)
-                    .bind(*arrival)
-                    .bind(line)
-                    .bind(int(line.len() as u64));
-            }
-            let mut others: usize = part.iter().filter(|it| it.line.1.is_empty()).count();
-            for (vehicle, stream, mark, bytes) in query.fetch_all(&mut *self.tx).await? {
-                others -= usize::from(mark.is_empty());
-                if let Some(stored) = streams.get_mut((&vehicle, &stream)) {
-                    stored.kept += 1;
-                    stored.kept_bytes += bytes;
-                }
-            }
-            if others > 0 {
-                // Alone in its group, it is refused alone.
-                let message = "a record has the number of another one that is stored";
-                let help = "revoke the vehicle, and enrol it again: then its streams begin again";
-                return Err(CloudError::usage(message, help));
+                lines,
+            )
+            .await?;
+        for (vehicle, stream, mark, bytes) in inserted {
+            others -= usize::from(mark.is_empty());
+            if let Some(stored) = streams.get_mut((&vehicle, &stream)) {
+                stored.kept += 1;
+                stored.kept_bytes += bytes;
             }
         }
-        Ok(())
-    }
-
-    /// Stores the positions of streams, and what is kept of them.
-    async fn set_streams(
-        &mut self,
-        keys: &[StreamKey<'_>],
-        streams: &StoredStreams,
-    ) -> CloudResult<()> {
-        for part in parts(keys) {
-            let sql = format!(
-                "INSERT INTO streams
-                 (vehicle, stream, life, next, seq, boot, boot_ns, kept, kept_bytes)
-                 VALUES {} ON CONFLICT (vehicle, stream) DO UPDATE SET life = excluded.life,
-                 next = excluded.next, seq = excluded.seq, boot = excluded.boot,
-                 boot_ns = excluded.boot_ns, kept = excluded.kept,
-                 kept_bytes = excluded.kept_bytes",
-                self.placeholders(part.len(), 9)
-            );
-            let mut query = sqlx::query(AssertSqlSafe(sql));
-            for key in part {
-                let Some(StoredStream { cursor, kept, kept_bytes }) = streams.get(*key) else {
-                    continue;
-                };
-                query = query
-                    .bind(key.0)
-                    .bind(key.1)
-                    .bind(int(cursor.life))
-                    .bind(int(cursor.next))
-                    .bind(int(cursor.seq))
-                    .bind(&cursor.boot)
-                    .bind(int(cursor.boot_ns))
-                    .bind(*kept)
-                    .bind(*kept_bytes);
-            }
-            query.execute(&mut *self.tx).await?;
+        if others > 0 {
+            // Alone in its group, it is refused alone.
+            let message = "a record has the number of another one that is stored";
+            let help = "revoke the vehicle, and enrol it again: then its streams begin again";
+            return Err(CloudError::usage(message, help));
         }
         Ok(())
     }
@@ -373,10 +276,8 @@ impl StoreChange<'_> {
             }
         }
         let names: Vec<_> = to_sum.keys().copied().collect();
-        let sums: Vec<(String, i64)> = rows_in!(&mut *self.tx;
-            "SELECT vehicle, CAST(SUM(kept_bytes) AS BIGINT) FROM streams
-             WHERE vehicle IN () GROUP BY vehicle";
-            &names);
+        let sums: Vec<(String, i64)> = rows_in!(self; "SELECT vehicle, CAST(SUM(kept_bytes)
+             AS BIGINT) FROM streams WHERE vehicle IN ($1..) GROUP BY vehicle"; &names);
         for (vehicle, bytes) in sums {
             let most = to_sum.get(&*vehicle).copied().unwrap_or(i64::MAX);
             if bytes > most {
@@ -390,10 +291,8 @@ impl StoreChange<'_> {
     async fn make_room_of_all(&mut self, name: &str, most: i64) -> CloudResult<()> {
         // Each step removes the excess, or all of a stream.
         for _ in 0..STREAMS_MAX {
-            let streams: Vec<(String, i64)> = rows!(&mut *self.tx;
-                "SELECT stream, kept_bytes FROM streams WHERE vehicle = $1
-                 ORDER BY kept_bytes DESC";
-                name);
+            let streams: Vec<(String, i64)> = rows!(self; "SELECT stream, kept_bytes
+                 FROM streams WHERE vehicle = $1 ORDER BY kept_bytes DESC"; name);
             let excess = streams.iter().map(|(_, bytes)| bytes).sum::<i64>() - most;
             let Some((stream, bytes)) = streams.first() else { break };
             if excess <= 0 {
@@ -420,10 +319,8 @@ impl StoreChange<'_> {
                 (records, bytes) = (records - chunk.0, bytes - chunk.1);
                 continue;
             }
-            let oldest: Vec<(i64, i64, i64)> = rows!(&mut *self.tx;
-                "SELECT arrival, seq, bytes FROM records WHERE vehicle = $1 AND stream = $2
-                 ORDER BY arrival LIMIT $3";
-                name, stream, STEP);
+            let oldest: Vec<(i64, i64, i64)> = rows!(self; "SELECT arrival, seq, bytes FROM records
+                 WHERE vehicle = $1 AND stream = $2 ORDER BY arrival LIMIT $3"; name, stream, STEP);
             let (mut removed, mut removed_bytes, mut last) = (0, 0, (0, 0));
             for (arrival, seq, length) in oldest {
                 if records <= 0 && bytes <= 0 {
@@ -450,13 +347,10 @@ impl StoreChange<'_> {
         to: i64,
         (records, bytes, seq): (i64, i64, i64),
     ) -> CloudResult<()> {
-        run!(&mut *self.tx;
-            "DELETE FROM records WHERE vehicle = $1 AND stream = $2 AND arrival <= $3";
+        run!(self; "DELETE FROM records WHERE vehicle = $1 AND stream = $2 AND arrival <= $3";
             vehicle, stream, to);
-        run!(&mut *self.tx;
-            "UPDATE streams SET kept = kept - $3, kept_bytes = kept_bytes - $4,
-             removed = removed + $3, removed_to = $5
-             WHERE vehicle = $1 AND stream = $2";
+        run!(self; "UPDATE streams SET kept = kept - $3, kept_bytes = kept_bytes - $4,
+             removed = removed + $3, removed_to = $5 WHERE vehicle = $1 AND stream = $2";
             vehicle, stream, records, bytes, seq);
         Ok(())
     }

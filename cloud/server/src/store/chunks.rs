@@ -4,39 +4,49 @@
 //! The file of a chunk is noted before it is stored, and the note is removed by the transaction
 //! that moves the records. Whatever is interrupted leaves a noted file, which is removed later.
 
-use super::{CloudStore, StoreChange, int, now, unsigned};
+use super::{CloudStore, StoreChange, int, now};
 use crate::error::CloudResult;
 
-/// Maximum number of records in a chunk.
 const CHUNK_RECORDS: i64 = 8192;
 /// Number of streams that are packed, and of files that are removed, at a time.
 const AT_ONCE: i64 = 500;
 
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct KeptLine {
-    pub(crate) arrival: i64,
-    pub(crate) life: u64,
-    pub(crate) seq: u64,
-    pub(crate) line: String,
+typed! {
+    #[derive(Debug, Clone, PartialEq, Eq)]
+    pub(crate) struct KeptLine {
+        pub(crate) arrival: i64,
+        pub(crate) life: u64,
+        pub(crate) seq: u64,
+        pub(crate) line: String,
+    }
 }
 
-/// A chunk, as the index has it.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub(crate) struct StoredChunk {
-    pub(crate) first_arrival: i64,
-    pub(crate) last_arrival: i64,
-    pub(crate) first_seq: u64,
-    pub(crate) last_seq: u64,
-    /// Times of its records, in ns since 1970; 0 if none has one.
-    pub(crate) first_time: i64,
-    pub(crate) last_time: i64,
-    /// The highest level of its records.
-    pub(crate) level: i64,
-    pub(crate) records: u64,
-    /// Bytes of its lines, and of its file.
-    pub(crate) bytes: u64,
-    pub(crate) stored_bytes: u64,
-    pub(crate) sha256: String,
+typed! {
+    #[derive(Debug, Clone, Default, PartialEq, Eq)]
+    pub(crate) struct StoredChunk {
+        pub(crate) first_arrival: i64,
+        pub(crate) last_arrival: i64,
+        pub(crate) first_seq: u64,
+        pub(crate) last_seq: u64,
+        /// Times of its records, in ns since 1970; 0 if none has one.
+        pub(crate) first_time: i64,
+        pub(crate) last_time: i64,
+        /// The highest level of its records.
+        pub(crate) level: i64,
+        pub(crate) records: u64,
+        /// Bytes of its lines, and of its file.
+        pub(crate) bytes: u64,
+        pub(crate) stored_bytes: u64,
+        pub(crate) sha256: String,
+    }
+}
+
+typed! {
+    /// A line, or its place, with its length.
+    struct SizedLine {
+        line: KeptLine,
+        bytes: u64,
+    }
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -51,26 +61,18 @@ impl ChunkSizes {
     pub(crate) const DEFAULT: ChunkSizes = ChunkSizes { chunk: 1 << 20, rows: 256 << 10 };
 }
 
-type ChunkRow = (i64, i64, i64, i64, i64, i64, i64, i64, i64, i64, String);
-
-/// The columns of a chunk.
 macro_rules! select {
     ($rest:literal) => {
-        concat!(
-            "SELECT first_arrival, last_arrival, first_seq, last_seq, first_time, last_time, \
-             level, records, bytes, stored_bytes, sha256 FROM chunks ",
-            $rest
-        )
+        concat! { "SELECT first_arrival, last_arrival, first_seq, last_seq,
+first_time, last_time, level, records, bytes, stored_bytes, sha256 FROM chunks ", $rest }
     };
 }
 
 impl CloudStore {
     /// Returns streams, with their vehicles, that have enough records in rows for a chunk.
     pub(crate) async fn packable(&self, sizes: ChunkSizes) -> CloudResult<Vec<(String, String)>> {
-        Ok(rows!(&self.pool;
-            "SELECT vehicle, stream FROM streams WHERE kept_bytes - packed_bytes >= $1
-             ORDER BY kept_bytes - packed_bytes DESC LIMIT $2";
-            sizes.chunk + sizes.rows, AT_ONCE))
+        Ok(rows!(self; "SELECT vehicle, stream FROM streams WHERE kept_bytes - packed_bytes >= $1
+             ORDER BY kept_bytes - packed_bytes DESC LIMIT $2"; sizes.chunk + sizes.rows, AT_ONCE))
     }
 
     /// Returns the oldest records of a stream in rows, enough for a chunk; none if there are not.
@@ -79,16 +81,14 @@ impl CloudStore {
         (vehicle, stream): (&str, &str),
         sizes: ChunkSizes,
     ) -> CloudResult<Vec<KeptLine>> {
-        let row: Option<(i64,)> = row!(&self.pool;
-            "SELECT kept_bytes - packed_bytes FROM streams WHERE vehicle = $1 AND stream = $2";
-            vehicle, stream);
-        let bytes = row.map_or(0, |(bytes,)| bytes);
+        let bytes: Option<i64> = row!(self; "SELECT kept_bytes - packed_bytes
+             FROM streams WHERE vehicle = $1 AND stream = $2"; vehicle, stream);
+        let bytes = bytes.unwrap_or(0);
         if bytes < sizes.chunk + sizes.rows {
             return Ok(Vec::new());
         }
-        let lengths: Vec<(i64, i64)> = rows!(&self.pool;
-            "SELECT arrival, bytes FROM records WHERE vehicle = $1 AND stream = $2
-             ORDER BY arrival LIMIT $3";
+        let lengths: Vec<(i64, i64)> = rows!(self; "SELECT arrival, bytes FROM records
+             WHERE vehicle = $1 AND stream = $2 ORDER BY arrival LIMIT $3";
             vehicle, stream, CHUNK_RECORDS);
         let (mut taken, mut last) = (0, None);
         for (arrival, length) in lengths {
@@ -101,18 +101,15 @@ impl CloudStore {
             (taken, last) = (taken + length, Some(arrival));
         }
         let Some(last) = last else { return Ok(Vec::new()) };
-        let rows: Vec<(i64, i64, i64, String)> = rows!(&self.pool;
-            "SELECT arrival, life, seq, line FROM records
-             WHERE vehicle = $1 AND stream = $2 AND arrival <= $3 ORDER BY arrival";
-            vehicle, stream, last);
-        Ok(rows.into_iter().map(kept).collect())
+        Ok(rows!(self;
+            "SELECT arrival, life, seq, line FROM records WHERE vehicle = $1
+             AND stream = $2 AND arrival <= $3 ORDER BY arrival"; vehicle, stream, last))
     }
 
     /// Notes the file of a chunk that is about to be stored.
     pub(crate) async fn note_chunk_file(&self, sha256: &str) -> CloudResult<()> {
         let mut change = self.change().await?;
-        run!(&mut *change.tx; "INSERT INTO chunk_files (sha256, since) VALUES ($1, $2)";
-            sha256, now());
+        run!(change; "INSERT INTO chunk_files (sha256, since) VALUES ($1, $2)"; sha256, now());
         change.commit().await
     }
 
@@ -126,26 +123,22 @@ impl CloudStore {
     ) -> CloudResult<bool> {
         let StoredChunk { first_arrival, last_arrival, records, bytes, stored_bytes, .. } = chunk;
         let mut change = self.change().await?;
-        let noted = run!(&mut *change.tx;
+        let noted = run!(change;
             "DELETE FROM chunk_files WHERE sha256 = $1 AND since > 0"; &chunk.sha256);
-        let moved = run!(&mut *change.tx;
-            "DELETE FROM records WHERE vehicle = $1 AND stream = $2 AND arrival >= $3
-             AND arrival <= $4";
-            vehicle, stream, first_arrival, last_arrival);
+        let moved = run!(change; "DELETE FROM records WHERE vehicle = $1 AND stream = $2
+             AND arrival >= $3 AND arrival <= $4"; vehicle, stream, first_arrival, last_arrival);
         if noted.rows_affected() != 1 || moved.rows_affected() != *records {
             return Ok(false);
         }
-        run!(&mut *change.tx;
-            "INSERT INTO chunks (vehicle, stream, first_arrival, last_arrival, first_seq, last_seq,
-             first_time, last_time, level, records, bytes, stored_bytes, sha256)
+        run!(change; "INSERT INTO chunks (vehicle, stream, first_arrival, last_arrival, first_seq,
+             last_seq, first_time, last_time, level, records, bytes, stored_bytes, sha256)
              VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13)";
-            vehicle, stream, first_arrival, last_arrival, int(chunk.first_seq),
-            int(chunk.last_seq), chunk.first_time, chunk.last_time, chunk.level, int(*records),
-            int(*bytes), int(*stored_bytes), &chunk.sha256);
-        run!(&mut *change.tx;
-            "UPDATE streams SET kept_bytes = kept_bytes - $3 + $4, packed = packed + $5,
+            vehicle, stream, first_arrival, last_arrival, chunk.first_seq, chunk.last_seq,
+            chunk.first_time, chunk.last_time, chunk.level, records, bytes, stored_bytes,
+            &chunk.sha256);
+        run!(change; "UPDATE streams SET kept_bytes = kept_bytes - $3 + $4, packed = packed + $5,
              packed_bytes = packed_bytes + $4 WHERE vehicle = $1 AND stream = $2";
-            vehicle, stream, int(*bytes), int(*stored_bytes), int(*records));
+            vehicle, stream, bytes, stored_bytes, records);
         change.commit().await?;
         Ok(true)
     }
@@ -157,11 +150,9 @@ impl CloudStore {
         (vehicle, stream): (&str, &str),
         (after, from): (i64, u64),
     ) -> CloudResult<Option<StoredChunk>> {
-        let row: Option<ChunkRow> = row!(&self.pool;
+        Ok(row!(self;
             select!("WHERE vehicle = $1 AND stream = $2 AND last_arrival > $3 AND last_seq >= $4
-             ORDER BY last_arrival LIMIT 1");
-            vehicle, stream, after, int(from));
-        Ok(row.map(chunk))
+             ORDER BY last_arrival LIMIT 1"); vehicle, stream, after, from))
     }
 
     /// Returns the newest chunk of a stream with a record between two arrivals, without both.
@@ -170,11 +161,10 @@ impl CloudStore {
         (vehicle, stream): (&str, &str),
         (after, before): (i64, i64),
     ) -> CloudResult<Option<StoredChunk>> {
-        let row: Option<ChunkRow> = row!(&self.pool;
+        Ok(row!(self;
             select!("WHERE vehicle = $1 AND stream = $2 AND first_arrival < $3
              AND last_arrival > $4 ORDER BY last_arrival DESC LIMIT 1");
-            vehicle, stream, before, after);
-        Ok(row.map(chunk))
+            vehicle, stream, before, after))
     }
 
     pub(crate) async fn has_chunk(
@@ -182,11 +172,10 @@ impl CloudStore {
         (vehicle, stream): (&str, &str),
         chunk: &StoredChunk,
     ) -> CloudResult<bool> {
-        let row: Option<(String,)> = row!(&self.pool;
-            "SELECT sha256 FROM chunks
-             WHERE vehicle = $1 AND stream = $2 AND last_arrival = $3 AND sha256 = $4";
-            vehicle, stream, chunk.last_arrival, &chunk.sha256);
-        Ok(row.is_some())
+        let found: Option<String> = row!(self;
+            "SELECT sha256 FROM chunks WHERE vehicle = $1 AND stream = $2 AND last_arrival = $3
+             AND sha256 = $4"; vehicle, stream, chunk.last_arrival, &chunk.sha256);
+        Ok(found.is_some())
     }
 
     /// Returns at most `most` of the last rows of a stream between two arrivals, the newest first.
@@ -198,14 +187,11 @@ impl CloudStore {
         (after, before): (i64, i64),
         (most, longest): (i64, i64),
     ) -> CloudResult<Vec<(KeptLine, u64)>> {
-        let rows: Vec<(i64, i64, i64, String, i64)> = rows!(&self.pool;
-            "SELECT arrival, life, seq, CASE WHEN bytes > $5 THEN '' ELSE line END, bytes
-             FROM records WHERE vehicle = $1 AND stream = $2 AND arrival < $3
-             AND arrival > $6 ORDER BY arrival DESC LIMIT $4";
-            vehicle, stream, before, most, longest, after);
-        let row =
-            |(arrival, life, seq, line, bytes)| (kept((arrival, life, seq, line)), unsigned(bytes));
-        Ok(rows.into_iter().map(row).collect())
+        let rows: Vec<SizedLine> = rows!(self;
+            "SELECT arrival, life, seq, CASE WHEN bytes > $5 THEN '' ELSE line END AS line, bytes
+             FROM records WHERE vehicle = $1 AND stream = $2 AND arrival < $3 AND arrival > $6
+             ORDER BY arrival DESC LIMIT $4"; vehicle, stream, before, most, longest, after);
+        Ok(rows.into_iter().map(|row| (row.line, row.bytes)).collect())
     }
 
     /// Returns files of chunks that no chunk needs: those to remove, and those whose chunk was not
@@ -213,20 +199,19 @@ impl CloudStore {
     pub(crate) async fn unneeded_chunk_files(&self, grace_s: i64) -> CloudResult<Vec<String>> {
         let late = now() - grace_s;
         let select = "SELECT sha256 FROM chunk_files WHERE since <= $1 ORDER BY since LIMIT $2";
-        let files: Vec<(String,)> = rows!(&self.pool; select; late, AT_ONCE);
+        let files: Vec<String> = rows!(self; select; late, AT_ONCE);
         if files.is_empty() {
             return Ok(Vec::new());
         }
         let mut change = self.change().await?;
-        run!(&mut *change.tx; "UPDATE chunk_files SET since = 0 WHERE since <= $1"; late);
+        run!(change; "UPDATE chunk_files SET since = 0 WHERE since <= $1"; late);
         change.commit().await?;
-        let files: Vec<(String,)> = rows!(&self.pool; select; 0_i64, AT_ONCE);
-        Ok(files.into_iter().map(|(sha256,)| sha256).collect())
+        Ok(rows!(self; select; 0_i64, AT_ONCE))
     }
 
     pub(crate) async fn forget_chunk_files(&self, removed: &[String]) -> CloudResult<()> {
         let mut change = self.change().await?;
-        change.run_in("DELETE FROM chunk_files WHERE sha256 IN", removed).await?;
+        change.run_in("DELETE FROM chunk_files WHERE sha256 IN ($1..)", removed, &[]).await?;
         change.commit().await
     }
 }
@@ -239,45 +224,18 @@ impl StoreChange<'_> {
         (vehicle, stream): (&str, &str),
         to: i64,
     ) -> CloudResult<Option<(i64, i64)>> {
-        let row: Option<ChunkRow> = row!(&mut *self.tx;
+        let chunk: Option<StoredChunk> = row!(self;
             select!("WHERE vehicle = $1 AND stream = $2 AND last_arrival <= $3
-             ORDER BY last_arrival LIMIT 1");
-            vehicle, stream, to);
-        let Some(chunk) = row.map(chunk) else { return Ok(None) };
-        run!(&mut *self.tx;
-            "DELETE FROM chunks WHERE vehicle = $1 AND stream = $2 AND last_arrival = $3";
+             ORDER BY last_arrival LIMIT 1"); vehicle, stream, to);
+        let Some(chunk) = chunk else { return Ok(None) };
+        run!(self; "DELETE FROM chunks WHERE vehicle = $1 AND stream = $2 AND last_arrival = $3";
             vehicle, stream, chunk.last_arrival);
-        run!(&mut *self.tx; "INSERT INTO chunk_files (sha256, since) VALUES ($1, 0)";
-            &chunk.sha256);
+        run!(self; "INSERT INTO chunk_files (sha256, since) VALUES ($1, 0)"; &chunk.sha256);
         let (records, bytes) = (int(chunk.records), int(chunk.stored_bytes));
-        run!(&mut *self.tx;
-            "UPDATE streams SET kept = kept - $3, kept_bytes = kept_bytes - $4,
+        run!(self; "UPDATE streams SET kept = kept - $3, kept_bytes = kept_bytes - $4,
              packed = packed - $3, packed_bytes = packed_bytes - $4,
              removed = removed + $3, removed_to = $5
-             WHERE vehicle = $1 AND stream = $2";
-            vehicle, stream, records, bytes, int(chunk.last_seq));
+             WHERE vehicle = $1 AND stream = $2"; vehicle, stream, records, bytes, chunk.last_seq);
         Ok(Some((records, bytes)))
-    }
-}
-
-fn kept((arrival, life, seq, line): (i64, i64, i64, String)) -> KeptLine {
-    KeptLine { arrival, life: unsigned(life), seq: unsigned(seq), line }
-}
-
-fn chunk(row: ChunkRow) -> StoredChunk {
-    let (first_arrival, last_arrival, first_seq, last_seq, first_time, last_time, ..) = row;
-    let (.., level, records, bytes, stored_bytes, sha256) = row;
-    StoredChunk {
-        first_arrival,
-        last_arrival,
-        first_seq: unsigned(first_seq),
-        last_seq: unsigned(last_seq),
-        first_time,
-        last_time,
-        level,
-        records: unsigned(records),
-        bytes: unsigned(bytes),
-        stored_bytes: unsigned(stored_bytes),
-        sha256,
     }
 }

@@ -5,8 +5,8 @@ use gleaner_fleet::people::ListPage;
 use schemars::JsonSchema;
 use serde::Deserialize;
 
+use super::CloudStore;
 use super::wants::next_wanted;
-use super::{CloudStore, int, unsigned};
 use crate::error::{CloudError, CloudResult};
 use crate::request::PageLimit;
 
@@ -32,16 +32,25 @@ pub(crate) struct ClipQuery {
     pub(crate) limit: PageLimit,
 }
 
-type ClipRow = (i64, String, String, String, i64, i64, i64, String, String, i64);
+typed! {
+    struct ClipRow {
+        seq: i64,
+        vehicle: String,
+        name: String,
+        facts: String,
+        bytes: u64,
+        has_thumbnail: bool,
+        is_requested: bool,
+        state: String,
+        reason: String,
+        received: u64,
+    }
+}
 
-/// The columns of a clip.
 macro_rules! select {
     ($rest:literal) => {
-        concat!(
-            "SELECT seq, vehicle, name, facts, bytes, has_thumbnail, is_requested, state, reason, \
-             received FROM clips ",
-            $rest
-        )
+        concat! { "SELECT seq, vehicle, name, facts, bytes, has_thumbnail,
+is_requested, state, reason, received FROM clips ", $rest }
     };
 }
 
@@ -50,7 +59,7 @@ impl CloudStore {
     pub(crate) async fn clips(&self, query: &ClipQuery) -> CloudResult<ListPage<FleetClip>> {
         let text = |value: &Option<String>| value.clone().unwrap_or_default();
         let count = u64::from(query.limit);
-        let rows: Vec<ClipRow> = rows!(&self.pool;
+        let rows: Vec<ClipRow> = rows!(self;
             select!("WHERE seq < $1 AND ($2 = '' OR vehicle = $2)
              AND ($3 = '' OR EXISTS (SELECT 1 FROM clip_words
                   WHERE kind = 'lambda' AND word = $3 AND clip = seq))
@@ -58,19 +67,18 @@ impl CloudStore {
                   WHERE kind = 'label' AND word = $4 AND clip = seq))
              AND to_ns >= $5 AND from_ns <= $6
              ORDER BY seq DESC LIMIT $7");
-            int(query.after.unwrap_or(u64::MAX)), text(&query.vehicle), text(&query.lambda),
+            query.after.unwrap_or(u64::MAX), text(&query.vehicle), text(&query.lambda),
             text(&query.label), query.from_ns.unwrap_or(i64::MIN),
-            query.to_ns.unwrap_or(i64::MAX), int(count));
+            query.to_ns.unwrap_or(i64::MAX), count);
         let is_full = rows.len() as u64 == count;
-        let next = rows.last().filter(|_| is_full).map(|row| row.0.to_string());
+        let next = rows.last().filter(|_| is_full).map(|row| row.seq.to_string());
         let upload = self.clip_policy().await?.upload;
         let items = rows.into_iter().map(|row| clip(row, upload)).collect::<CloudResult<_>>()?;
         Ok(ListPage { items, next })
     }
 
-    /// Returns a clip.
     pub(crate) async fn clip(&self, id: &ClipId) -> CloudResult<FleetClip> {
-        let row: Option<ClipRow> = row!(&self.pool;
+        let row: Option<ClipRow> = row!(self;
             select!("WHERE vehicle = $1 AND name = $2"); id.vehicle(), id.name());
         let missing =
             || CloudError::missing(format!("there is no clip `{id}`"), "`gleaner clips` lists all");
@@ -93,38 +101,29 @@ impl CloudStore {
             ClipState::Stored if !is_lost => return Ok(before),
             ClipState::Gone => return refused("its vehicle has deleted it", "choose another clip"),
             _ if self.clip_policy().await?.upload == UploadedClips::None => {
-                return refused(
-                    "the cloud fetches no clips",
-                    "change that: `gleaner clips policy on-demand`",
-                );
+                let help = "change that: `gleaner clips policy on-demand`";
+                return refused("the cloud fetches no clips", help);
             }
             _ => {}
         }
-        let (is_revoked,): (i64,) = one!(&self.pool;
+        let is_revoked: bool = one!(self;
             "SELECT is_revoked FROM vehicles WHERE name = $1"; id.vehicle());
-        if is_revoked != 0 {
-            return refused(
-                "its vehicle was cut off, and can send nothing",
-                "enrol the vehicle again, or choose another clip",
-            );
+        if is_revoked {
+            let help = "enrol the vehicle again, or choose another clip";
+            return refused("its vehicle was cut off, and can send nothing", help);
         }
         let mut change = self.change().await?;
         // It may have been stored since: that is not undone.
-        let is_lost = i64::from(is_lost);
-        let changed = run!(&mut *change.tx;
-            "UPDATE clips SET is_requested = 1, failures = 0,
-             state = CASE WHEN sha256 = '' THEN state ELSE 'vehicle' END,
-             parts = CASE WHEN state = 'stored' THEN 0 ELSE parts END,
-             received = CASE WHEN state = 'stored' THEN 0 ELSE received END
-             WHERE vehicle = $1 AND name = $2 AND (is_requested = 0 OR state <> 'vehicle')
-             AND state <> 'gone' AND (state <> 'stored' OR $3 = 1)";
-            id.vehicle(), id.name(), is_lost);
+        let changed = run!(change; "UPDATE clips SET is_requested = 1, failures = 0, state = CASE
+             WHEN sha256 = '' THEN state ELSE 'vehicle' END, parts = CASE WHEN state = 'stored'
+             THEN 0 ELSE parts END, received = CASE WHEN state = 'stored' THEN 0 ELSE received END
+             WHERE vehicle = $1 AND name = $2 AND (is_requested = 0 OR state <> 'vehicle') AND
+             state <> 'gone' AND (state <> 'stored' OR $3 = 1)"; id.vehicle(), id.name(), is_lost);
         if changed.rows_affected() > 0 {
             change.count_clip_bytes(id.vehicle()).await?;
             change.note(actor, "pull clip", &id.to_string()).await?;
             // The vehicle reads its orders again with each new number.
-            run!(&mut *change.tx;
-                concat!("UPDATE vehicles SET ", next_wanted!(), " WHERE name = $1"); id.vehicle());
+            run!(change; next_wanted!(" WHERE name = $1"); id.vehicle());
         }
         change.commit().await?;
         self.clip(id).await
@@ -132,31 +131,28 @@ impl CloudStore {
 }
 
 fn clip(row: ClipRow, upload: UploadedClips) -> CloudResult<FleetClip> {
-    let (_, vehicle, name, facts, bytes, has_thumbnail, is_requested, state, reason, received) =
-        row;
     let damaged = |error: String| {
-        CloudError::usage(format!("the clip `{name}` of `{vehicle}` is damaged"), "report this")
-            .because(error)
+        let message = format!("the clip `{}` of `{}` is damaged", row.name, row.vehicle);
+        CloudError::usage(message, "report this").because(error)
     };
     let facts: ClipFacts =
-        serde_json::from_str(&facts).map_err(|error| damaged(error.to_string()))?;
-    let id = ClipId::new(facts.name.clone(), &vehicle).map_err(damaged)?;
-    let (bytes, received) = (unsigned(bytes), unsigned(received));
-    let state = match &*state {
+        serde_json::from_str(&row.facts).map_err(|error| damaged(error.to_string()))?;
+    let id = ClipId::new(facts.name.clone(), &row.vehicle).map_err(damaged)?;
+    let state = match &*row.state {
         "stored" => ClipState::Stored,
         "gone" => ClipState::Gone,
         "failed" => ClipState::Failed,
-        _ if !upload.wants(is_requested != 0) => ClipState::OnVehicle,
-        _ if received > 0 => ClipState::Uploading,
+        _ if !upload.wants(row.is_requested) => ClipState::OnVehicle,
+        _ if row.received > 0 => ClipState::Uploading,
         _ => ClipState::Wanted,
     };
     Ok(FleetClip {
         id,
-        vehicle,
         state,
-        received: received.min(bytes),
-        reason: (!reason.is_empty()).then_some(reason),
-        has_thumbnail: has_thumbnail != 0,
+        received: row.received.min(row.bytes),
+        reason: Some(row.reason).filter(|it| !it.is_empty()),
+        has_thumbnail: row.has_thumbnail,
+        vehicle: row.vehicle,
         facts,
     })
 }

@@ -13,12 +13,10 @@ use crate::error::{CloudError, CloudResult};
 /// and bytes that a request counts as at least.
 pub(super) const CLIP_MIN: u64 = 4 << 10;
 
-/// Bounds of what is kept of clips.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct ClipBounds {
     /// Clips of a vehicle, with files or without.
     pub(crate) clips: u64,
-    /// Bytes of a vehicle.
     pub(crate) vehicle_bytes: u64,
     /// Bytes of all vehicles.
     pub(crate) bytes: u64,
@@ -55,7 +53,6 @@ impl UsedBytes {
         Self { own: unsigned(own), all: unsigned(all) }
     }
 
-    /// Returns whether a further file of this length fits.
     pub(super) fn fits(&self, bytes: u64, bounds: ClipBounds) -> bool {
         self.excess(bytes, bounds).is_none()
     }

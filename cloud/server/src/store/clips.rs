@@ -12,7 +12,7 @@ use super::clip_quotas::{CLIP_MIN, ClipBounds};
 use super::numbers::check_number;
 use super::vehicles::ended;
 use super::wants::next_wanted;
-use super::{CloudStore, StoreChange, int, unsigned};
+use super::{CloudStore, StoreChange, int};
 use crate::error::{CloudError, CloudResult};
 
 /// Number of clips of a vehicle that are wanted, and of thumbnails, in its orders.
@@ -33,11 +33,23 @@ pub(crate) struct ClipProgress {
     pub(crate) received: u64,
 }
 
-/// A part of a file that was acknowledged.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct StoredPart {
-    pub(crate) sha256: String,
-    pub(crate) bytes: u64,
+typed! {
+    struct ProgressRow {
+        bytes: u64,
+        sha256: String,
+        parts: u64,
+        received: u64,
+        is_requested: bool,
+        state: String,
+    }
+}
+
+typed! {
+    #[derive(Debug, Clone, PartialEq, Eq)]
+    pub(crate) struct StoredPart {
+        pub(crate) sha256: String,
+        pub(crate) bytes: u64,
+    }
 }
 
 impl CloudStore {
@@ -58,10 +70,8 @@ impl CloudStore {
             change.lose_clip(vehicle, name, reason, *is_thumbnail).await?;
         }
         if let Some(position) = &report.cursor {
-            run!(&mut *change.tx;
-                "INSERT INTO clip_vehicles (vehicle, position) VALUES ($1, $2)
-                 ON CONFLICT (vehicle) DO UPDATE SET position = excluded.position";
-                vehicle, position);
+            run!(change; "INSERT INTO clip_vehicles (vehicle, position) VALUES ($1, $2) ON
+                 CONFLICT (vehicle) DO UPDATE SET position = excluded.position"; vehicle, position);
         }
         change.forget_clips(vehicle, bounds).await?;
         change.count_clip_bytes(vehicle).await?;
@@ -74,31 +84,25 @@ impl CloudStore {
         vehicle: &str,
         bounds: ClipBounds,
     ) -> CloudResult<ClipOrders> {
-        let row: Option<(String,)> = row!(&self.pool;
+        let position: Option<String> = row!(self;
             "SELECT position FROM clip_vehicles WHERE vehicle = $1"; vehicle);
-        let position = row.unwrap_or_default().0;
         let policy = self.clip_policy().await?;
         let budget = self.clip_budget(vehicle, &policy).await?;
-        let unreadable: Vec<(String,)> = rows!(&self.pool;
-            "SELECT name FROM clips WHERE vehicle = $1 AND state = 'failed' AND sha256 = ''
-             ORDER BY is_requested DESC, seq LIMIT $2";
-            vehicle, ORDERS_MAX);
-        let names = |rows: Vec<(String,)>| {
-            rows.into_iter().filter_map(|(name,)| name.parse().ok()).collect()
-        };
+        let unreadable: Vec<String> = rows!(self; "SELECT name FROM clips
+             WHERE vehicle = $1 AND state = 'failed' AND sha256 = ''
+             ORDER BY is_requested DESC, seq LIMIT $2"; vehicle, ORDERS_MAX);
+        let parsed = |names: &[String]| names.iter().filter_map(|it| it.parse().ok()).collect();
         let mut orders = ClipOrders {
-            cursor: (!position.is_empty()).then_some(position),
-            unreadable: names(unreadable),
+            cursor: position.filter(|it| !it.is_empty()),
+            unreadable: parsed(&unreadable),
             budget: Some(budget),
             ..ClipOrders::default()
         };
         if !budget.is_spent {
-            let rows: Vec<(String,)> = rows!(&self.pool;
-                "SELECT name FROM clips WHERE vehicle = $1 AND thumbnail <> ''
-                 AND has_thumbnail = 0 ORDER BY seq LIMIT $2";
-                vehicle, ORDERS_MAX);
-            if !rows.is_empty() && self.clip_usage(vehicle).await?.fits(THUMBNAIL_MAX, bounds) {
-                orders.thumbnails = names(rows);
+            let names: Vec<String> = rows!(self; "SELECT name FROM clips WHERE vehicle = $1 AND
+                 thumbnail <> '' AND has_thumbnail = 0 ORDER BY seq LIMIT $2"; vehicle, ORDERS_MAX);
+            if !names.is_empty() && self.clip_usage(vehicle).await?.fits(THUMBNAIL_MAX, bounds) {
+                orders.thumbnails = parsed(&names);
             }
             orders.wanted = self.wanted_clips(vehicle, &policy, bounds).await?;
         }
@@ -114,20 +118,18 @@ impl CloudStore {
         bounds: ClipBounds,
     ) -> CloudResult<Vec<WantedClip>> {
         let unfinished = self.unfinished_clips(vehicle).await?;
-        let may_begin = i64::from(unfinished < bounds.unfinished);
-        let rows: Vec<(String, i64, String, i64)> = rows!(&self.pool;
-            "SELECT name, bytes, sha256, received FROM clips
-             WHERE vehicle = $1 AND state = 'vehicle' AND sha256 <> '' AND bytes > 0
-             AND $2 <> 'none' AND (is_requested = 1 OR $2 = 'all') AND (parts > 0 OR $3 = 1)
-             ORDER BY is_requested DESC, score DESC, from_ns, seq LIMIT $4";
-            vehicle, policy.upload.as_str(), may_begin, ORDERS_MAX);
+        let rows: Vec<(String, u64, String, u64)> = rows!(self; "SELECT name, bytes,
+             sha256, received FROM clips WHERE vehicle = $1 AND state = 'vehicle' AND sha256 <> ''
+             AND bytes > 0 AND $2 <> 'none' AND (is_requested = 1 OR $2 = 'all') AND (parts > 0
+             OR $3 = 1) ORDER BY is_requested DESC, score DESC, from_ns, seq LIMIT $4";
+            vehicle, policy.upload.as_str(), unfinished < bounds.unfinished, ORDERS_MAX);
         if rows.is_empty() {
             return Ok(Vec::new());
         }
         let usage = self.clip_usage(vehicle).await?;
-        let wanted = rows.into_iter().filter_map(|(name, bytes, sha256, received)| {
-            let (name, bytes, from) = (name.parse().ok()?, unsigned(bytes), unsigned(received));
-            Some(WantedClip { name, bytes, sha256, part: from / CLIP_PART, from: Some(from) })
+        let wanted = rows.into_iter().filter_map(|(name, bytes, sha256, from)| {
+            let (name, part) = (name.parse().ok()?, from / CLIP_PART);
+            Some(WantedClip { name, bytes, sha256, part, from: Some(from) })
         });
         // Files that do not fit must not keep smaller ones from being sent.
         let fits = |it: &WantedClip| it.from > Some(0) || usage.fits(it.bytes, bounds);
@@ -137,18 +139,12 @@ impl CloudStore {
     /// Returns the number of files of a vehicle that have not come in full yet, also of those that
     /// it cannot read now.
     async fn unfinished_clips(&self, vehicle: &str) -> CloudResult<u64> {
-        let (unfinished,): (i64,) = one!(&self.pool;
-            "SELECT COUNT(*) FROM clips
-             WHERE vehicle = $1 AND state IN ('vehicle', 'failed') AND parts > 0";
-            vehicle);
-        Ok(unsigned(unfinished))
+        Ok(one!(self; "SELECT COUNT(*) FROM clips
+             WHERE vehicle = $1 AND state IN ('vehicle', 'failed') AND parts > 0"; vehicle))
     }
 
     /// Returns the progress of a file that a vehicle may send now.
-    ///
-    /// # Errors
-    ///
-    /// An error if the file is not wanted, or does not fit.
+    /// Fails if the file is not wanted, or does not fit.
     pub(crate) async fn clip_progress(
         &self,
         vehicle: &str,
@@ -159,19 +155,18 @@ impl CloudStore {
             let message = format!("clip `{name}` is not wanted of this vehicle");
             CloudError::missing(message, "ask for the orders again: `POST /v1/clips`")
         };
-        let row: Option<(i64, String, i64, i64, i64, String)> = row!(&self.pool;
-            "SELECT bytes, sha256, parts, received, is_requested, state FROM clips
-             WHERE vehicle = $1 AND name = $2 AND sha256 <> ''";
-            vehicle, name.as_str());
-        let (bytes, sha256, parts, received, is_requested, state) = row.ok_or_else(not_wanted)?;
+        let row: Option<ProgressRow> = row!(self;
+            "SELECT bytes, sha256, parts, received, is_requested, state
+             FROM clips WHERE vehicle = $1 AND name = $2 AND sha256 <> ''"; vehicle, name.as_str());
+        let row = row.ok_or_else(not_wanted)?;
+        let ProgressRow { bytes, sha256, parts, received, is_requested, state } = row;
         let id = ClipId::new(name.clone(), vehicle).map_err(|_| not_wanted())?;
-        let [bytes, part, received] = [bytes, parts, received].map(unsigned);
-        let progress = ClipProgress { id, bytes, sha256, part, received };
+        let progress = ClipProgress { id, bytes, sha256, part: parts, received };
         if state == "stored" {
             return Ok(progress);
         }
         let policy = self.clip_policy().await?;
-        if !policy.upload.wants(is_requested != 0) || state != "vehicle" {
+        if !policy.upload.wants(is_requested) || state != "vehicle" {
             return Err(not_wanted());
         }
         let is_new = progress.part == 0;
@@ -190,10 +185,7 @@ impl CloudStore {
 
     /// Notes that a part is durable, unless it was noted already or the vehicle does not count any
     /// more. With the last one, the file is stored.
-    ///
-    /// # Errors
-    ///
-    /// Also one if the file does not fit any more, as others have begun meanwhile.
+    /// Fails also if the file does not fit any more, as others have begun meanwhile.
     pub(crate) async fn clip_part_received(
         &self,
         progress: &ClipProgress,
@@ -204,18 +196,15 @@ impl CloudStore {
         let ClipProgress { id, part, .. } = progress;
         let mut change = self.change().await?;
         change.must_count(id.vehicle()).await?;
-        let stored = run!(&mut *change.tx;
-            "UPDATE clips SET parts = parts + 1, received = received + $6, part_time = $4,
-             reason = '', state = CASE WHEN $5 = 1 THEN 'stored' ELSE state END
+        let stored = run!(change; "UPDATE clips SET parts = parts + 1, received = received + $6,
+             part_time = $4, reason = '', state = CASE WHEN $5 = 1 THEN 'stored' ELSE state END
              WHERE vehicle = $1 AND name = $2 AND parts = $3 AND state = 'vehicle'";
-            id.vehicle(), id.name(), int(*part), self.age_now(), i64::from(is_last), int(length));
+            id.vehicle(), id.name(), part, self.age_now(), is_last, length);
         if stored.rows_affected() > 0 {
-            run!(&mut *change.tx;
-                "INSERT INTO clip_parts (clip, part, sha256, bytes)
-                 SELECT seq, $3, $4, $5 FROM clips WHERE vehicle = $1 AND name = $2
-                 ON CONFLICT (clip, part) DO UPDATE
-                 SET sha256 = excluded.sha256, bytes = excluded.bytes";
-                id.vehicle(), id.name(), int(*part), sha256, int(length));
+            run!(change; "INSERT INTO clip_parts (clip, part, sha256, bytes) SELECT seq, $3, $4, $5
+                 FROM clips WHERE vehicle = $1 AND name = $2 ON CONFLICT (clip, part)
+                 DO UPDATE SET sha256 = excluded.sha256, bytes = excluded.bytes";
+                id.vehicle(), id.name(), part, sha256, length);
         }
         if *part == 0 {
             change.count_clip_bytes(id.vehicle()).await?;
@@ -224,15 +213,11 @@ impl CloudStore {
         change.commit().await
     }
 
-    /// Returns the parts of a file that were acknowledged.
     pub(crate) async fn clip_parts(&self, id: &ClipId) -> CloudResult<Vec<StoredPart>> {
-        let rows: Vec<(String, i64)> = rows!(&self.pool;
-            "SELECT clip_parts.sha256, clip_parts.bytes FROM clip_parts
-             JOIN clips ON clips.seq = clip_parts.clip
+        Ok(rows!(self; "SELECT clip_parts.sha256, clip_parts.bytes
+             FROM clip_parts JOIN clips ON clips.seq = clip_parts.clip
              WHERE vehicle = $1 AND name = $2 AND part < parts ORDER BY part";
-            id.vehicle(), id.name());
-        let part = |(sha256, bytes)| StoredPart { sha256, bytes: unsigned(bytes) };
-        Ok(rows.into_iter().map(part).collect())
+            id.vehicle(), id.name()))
     }
 
     /// Forgets the parts of a file, which was not the announced one or is not there; returns
@@ -240,11 +225,10 @@ impl CloudStore {
     pub(crate) async fn clip_upload_failed(&self, id: &ClipId, reason: &str) -> CloudResult<bool> {
         let mut change = self.change().await?;
         change.note_removed(id.vehicle(), id.name(), false).await?;
-        let failed = run!(&mut *change.tx;
-            "UPDATE clips SET parts = 0, received = 0, failures = failures + 1, reason = $3,
-             state = CASE WHEN failures + 1 >= $4 THEN 'failed' ELSE 'vehicle' END
-             WHERE vehicle = $1 AND name = $2 AND state = 'vehicle'";
-            id.vehicle(), id.name(), excerpt(reason), FAILURES_MAX);
+        let failed = run!(change; "UPDATE clips SET parts = 0, received = 0,
+             failures = failures + 1, reason = $3, state = CASE WHEN failures + 1 >= $4
+             THEN 'failed' ELSE 'vehicle' END WHERE vehicle = $1 AND name = $2
+             AND state = 'vehicle'"; id.vehicle(), id.name(), excerpt(reason), FAILURES_MAX);
         if failed.rows_affected() == 0 {
             return Ok(false);
         }
@@ -259,21 +243,16 @@ impl CloudStore {
         vehicle: &str,
         name: &ClipName,
     ) -> CloudResult<Option<String>> {
-        let row: Option<(String,)> = row!(&self.pool;
-            "SELECT thumbnail FROM clips
-             WHERE vehicle = $1 AND name = $2 AND thumbnail <> '' AND has_thumbnail = 0";
-            vehicle, name.as_str());
-        Ok(row.map(|(sha256,)| sha256))
+        Ok(row!(self;
+            "SELECT thumbnail FROM clips WHERE vehicle = $1
+             AND name = $2 AND thumbnail <> '' AND has_thumbnail = 0"; vehicle, name.as_str()))
     }
 
-    /// Notes that the thumbnail of a clip is durable.
     pub(crate) async fn thumbnail_received(&self, id: &ClipId, bytes: u64) -> CloudResult<()> {
         let mut change = self.change().await?;
         change.must_count(id.vehicle()).await?;
-        run!(&mut *change.tx;
-            "UPDATE clips SET has_thumbnail = 1, disk = disk + $3
-             WHERE vehicle = $1 AND name = $2 AND has_thumbnail = 0";
-            id.vehicle(), id.name(), int(bytes));
+        run!(change; "UPDATE clips SET has_thumbnail = 1, disk = disk + $3 WHERE vehicle = $1
+             AND name = $2 AND has_thumbnail = 0"; id.vehicle(), id.name(), bytes);
         change.count_clip_bytes(id.vehicle()).await?;
         change.commit().await
     }
@@ -281,10 +260,8 @@ impl CloudStore {
     /// Forgets the announcement of a thumbnail that is no image.
     pub(crate) async fn thumbnail_refused(&self, id: &ClipId, sha256: &str) -> CloudResult<()> {
         let mut change = self.change().await?;
-        run!(&mut *change.tx;
-            "UPDATE clips SET thumbnail = ''
-             WHERE vehicle = $1 AND name = $2 AND thumbnail = $3 AND has_thumbnail = 0";
-            id.vehicle(), id.name(), sha256);
+        run!(change; "UPDATE clips SET thumbnail = '' WHERE vehicle = $1 AND name = $2
+             AND thumbnail = $3 AND has_thumbnail = 0"; id.vehicle(), id.name(), sha256);
         change.commit().await
     }
 
@@ -293,28 +270,24 @@ impl CloudStore {
     pub(crate) async fn forget_unfinished_clips(&self, seconds: u64) -> CloudResult<()> {
         let [before, unreadable] = [seconds, UNREADABLE_S].map(|it| self.age_now() - int(it));
         let mut change = self.change().await?;
-        let rows: Vec<(String, String)> = rows!(&mut *change.tx;
-            "SELECT name, vehicle FROM clips
+        let rows: Vec<(String, String)> = rows!(change; "SELECT name, vehicle FROM clips
              WHERE state IN ('vehicle', 'failed') AND parts > 0
-             AND part_time <= CASE WHEN state = 'failed' THEN $2 ELSE $1 END";
-            before, unreadable);
+             AND part_time <= CASE WHEN state = 'failed' THEN $2 ELSE $1 END"; before, unreadable);
         for (name, vehicle) in &rows {
             change.note_removed(vehicle, name, false).await?;
-            run!(&mut *change.tx;
-                "UPDATE clips SET parts = 0, received = 0 WHERE vehicle = $1 AND name = $2";
-                vehicle, name);
+            run!(change; "UPDATE clips
+                 SET parts = 0, received = 0 WHERE vehicle = $1 AND name = $2"; vehicle, name);
             change.count_clip_bytes(vehicle).await?;
         }
         change.commit().await
     }
 
     pub(crate) async fn clip_policy(&self) -> CloudResult<ClipPolicy> {
-        let (upload, day_bytes, keep_s, keep_bytes): (String, i64, i64, i64) =
-            one!(&self.pool; "SELECT upload, day_bytes, keep_s, keep_bytes FROM clip_policy");
+        let (upload, day_bytes, keep_s, keep_bytes): (String, u64, u64, u64) =
+            one!(self; "SELECT upload, day_bytes, keep_s, keep_bytes FROM clip_policy");
         let upload = upload.parse().map_err(|error: String| {
             CloudError::usage("the rules for clips are damaged", "set them again").because(error)
         })?;
-        let [day_bytes, keep_s, keep_bytes] = [day_bytes, keep_s, keep_bytes].map(unsigned);
         Ok(ClipPolicy { upload, day_bytes, keep_s, keep_bytes })
     }
 
@@ -327,33 +300,30 @@ impl CloudStore {
         let mut change = self.change().await?;
         let ClipPolicy { upload, day_bytes, keep_s, keep_bytes } = policy;
         check_number("a bound of clips", *day_bytes.max(keep_s).max(keep_bytes))?;
-        run!(&mut *change.tx;
-            "UPDATE clip_policy SET upload = $1, day_bytes = $2, keep_s = $3, keep_bytes = $4";
-            upload.as_str(), int(*day_bytes), int(*keep_s), int(*keep_bytes));
+        run!(change; "UPDATE clip_policy SET upload = $1, day_bytes = $2,
+             keep_s = $3, keep_bytes = $4"; upload.as_str(), day_bytes, keep_s, keep_bytes);
         let mut text = format!("{}, {day_bytes} bytes a day", upload.as_str());
         if *keep_s > 0 || *keep_bytes > 0 {
             text += &format!(", keep {keep_s} s and {keep_bytes} bytes");
         }
         change.note(actor, "set policy of clips", &text).await?;
-        let vehicles: Vec<(String,)> = rows!(&mut *change.tx;
-            concat!("UPDATE vehicles SET ", next_wanted!(),
-                " WHERE is_revoked = 0 AND epoch > 0 RETURNING name"));
+        let connected = next_wanted!(" WHERE is_revoked = 0 AND epoch > 0 RETURNING name");
+        let vehicles = rows!(change; connected);
         change.commit().await?;
-        Ok(vehicles.into_iter().map(|(name,)| name).collect())
+        Ok(vehicles)
     }
 }
 
 impl StoreChange<'_> {
     /// Fails unless the vehicle counts: it may have been cut off since its request came.
     async fn must_count(&mut self, vehicle: &str) -> CloudResult<()> {
-        let row: Option<(String,)> = row!(&mut *self.tx;
+        let counting: Option<String> = row!(self;
             "SELECT name FROM vehicles WHERE name = $1 AND is_revoked = 0"; vehicle);
-        row.map(drop).ok_or_else(ended)
+        counting.map(drop).ok_or_else(ended)
     }
 
-    /// Stores what a clip is.
     async fn add_clip(&mut self, vehicle: &str, facts: &ClipFacts) -> CloudResult<()> {
-        let (last,): (i64,) = one!(&mut *self.tx; "SELECT COALESCE(MAX(seq), 0) FROM clips");
+        let last: i64 = one!(self; "SELECT COALESCE(MAX(seq), 0) FROM clips");
         let (name, sha256) = (facts.name.as_str(), facts.sha256.as_deref().unwrap_or(""));
         let scores = facts.moments.iter().filter_map(|moment| moment.score);
         // A cast of a float stops at the bounds of the integer.
@@ -367,14 +337,12 @@ impl StoreChange<'_> {
             (true, false) => "failed",
             (false, _) => "vehicle",
         };
-        let inserted = run!(&mut *self.tx;
-            "INSERT INTO clips (seq, vehicle, name, facts, from_ns, to_ns, bytes, sha256, thumbnail,
-             score, state, reason, disk)
-             VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13)
-             ON CONFLICT (vehicle, name) DO NOTHING";
-            last + 1, vehicle, name, &text, facts.from_ns, facts.to_ns, int(facts.bytes), sha256,
+        let inserted = run!(self; "INSERT INTO clips (seq, vehicle, name, facts, from_ns,
+             to_ns, bytes, sha256, thumbnail, score, state, reason, disk) VALUES ($1, $2, $3,
+             $4, $5, $6, $7, $8, $9, $10, $11, $12, $13) ON CONFLICT (vehicle, name) DO NOTHING";
+            last + 1, vehicle, name, &text, facts.from_ns, facts.to_ns, facts.bytes, sha256,
             facts.thumbnail.as_deref().unwrap_or(""), score, state, &reason,
-            int(CLIP_MIN + text.len() as u64));
+            CLIP_MIN + text.len() as u64);
         if inserted.rows_affected() == 0 {
             return self.change_clip(vehicle, facts, (state, &reason), &text).await;
         }
@@ -384,8 +352,7 @@ impl StoreChange<'_> {
         let words = lambdas.chain(labels).filter(|(_, word)| !word.contains('\0'));
         let words: BTreeSet<_> = words.collect();
         for (kind, word) in words {
-            run!(&mut *self.tx;
-                "INSERT INTO clip_words (kind, word, clip) VALUES ($1, $2, $3)";
+            run!(self; "INSERT INTO clip_words (kind, word, clip) VALUES ($1, $2, $3)";
                 kind, word, last + 1);
         }
         Ok(())
@@ -406,28 +373,24 @@ impl StoreChange<'_> {
             return self.lose_clip(vehicle, &facts.name, reason, false).await;
         }
         if state == "failed" {
-            run!(&mut *self.tx;
-                "UPDATE clips SET sha256 = '', state = 'failed', reason = $3
+            run!(self; "UPDATE clips SET sha256 = '', state = 'failed', reason = $3
                  WHERE vehicle = $1 AND name = $2 AND state IN ('vehicle', 'failed')";
                 vehicle, name, reason);
             return Ok(());
         }
-        let (sha256_before, bytes, text_before): (String, i64, String) = one!(&mut *self.tx;
-            "SELECT sha256, bytes, facts FROM clips WHERE vehicle = $1 AND name = $2";
-            vehicle, name);
-        if sha256_before.is_empty() && bytes != int(facts.bytes) {
+        let (sha256_before, bytes, text_before): (String, u64, String) = one!(self; "SELECT sha256,
+             bytes, facts FROM clips WHERE vehicle = $1 AND name = $2"; vehicle, name);
+        if sha256_before.is_empty() && bytes != facts.bytes {
             self.note_removed(vehicle, name, false).await?;
         }
         // It goes on where it was: all of the file is compared at its end.
-        let is_read = run!(&mut *self.tx;
-            "UPDATE clips SET sha256 = $3, state = 'vehicle', reason = '', facts = $4, bytes = $5,
-             thumbnail = CASE WHEN has_thumbnail = 1 THEN thumbnail ELSE $6 END, failures = 0,
-             parts = CASE WHEN bytes = $5 THEN parts ELSE 0 END,
-             received = CASE WHEN bytes = $5 THEN received ELSE 0 END,
-             disk = disk + $7
+        let is_read = run!(self; "UPDATE clips SET sha256 = $3, state = 'vehicle',
+             reason = '', facts = $4, bytes = $5, thumbnail = CASE WHEN has_thumbnail = 1
+             THEN thumbnail ELSE $6 END, failures = 0, parts = CASE WHEN bytes = $5 THEN parts
+             ELSE 0 END, received = CASE WHEN bytes = $5 THEN received ELSE 0 END, disk = disk + $7
              WHERE vehicle = $1 AND name = $2 AND sha256 = '' AND state = 'failed'";
-            vehicle, name, sha256, text, int(facts.bytes),
-            facts.thumbnail.as_deref().unwrap_or(""), text.len() as i64 - text_before.len() as i64);
+            vehicle, name, sha256, text, facts.bytes, facts.thumbnail.as_deref().unwrap_or(""),
+            text.len() as i64 - text_before.len() as i64);
         if is_read.rows_affected() == 0 && sha256_before != sha256 {
             tracing::warn!(vehicle, clip = name, "a clip was announced again, as another file");
         }
@@ -444,36 +407,28 @@ impl StoreChange<'_> {
     ) -> CloudResult<()> {
         let (name, reason) = (name.as_str(), visible(&excerpt(reason)));
         if is_thumbnail {
-            run!(&mut *self.tx;
-                "UPDATE clips SET thumbnail = '' WHERE vehicle = $1 AND name = $2
-                 AND has_thumbnail = 0";
-                vehicle, name);
+            run!(self; "UPDATE clips SET thumbnail = ''
+                 WHERE vehicle = $1 AND name = $2 AND has_thumbnail = 0"; vehicle, name);
             return Ok(());
         }
         self.note_removed(vehicle, name, false).await?;
-        run!(&mut *self.tx;
-            "UPDATE clips SET state = 'gone', reason = $3, parts = 0, received = 0
-             WHERE vehicle = $1 AND name = $2 AND state IN ('vehicle', 'failed')";
-            vehicle, name, reason);
+        run!(self; "UPDATE clips SET state = 'gone', reason = $3, parts = 0, received = 0 WHERE
+             vehicle = $1 AND name = $2 AND state IN ('vehicle', 'failed')"; vehicle, name, reason);
         Ok(())
     }
 
     /// Forgets the oldest clips of a vehicle above the bound, but those whose files are stored.
     async fn forget_clips(&mut self, vehicle: &str, bounds: ClipBounds) -> CloudResult<()> {
-        let (count,): (i64,) = one!(&mut *self.tx;
+        let count: i64 = one!(self;
             "SELECT COUNT(*) FROM clips WHERE vehicle = $1 AND state <> 'stored'"; vehicle);
         let above = count - int(bounds.clips);
         if above <= 0 {
             return Ok(());
         }
-        let rows: Vec<(i64, String)> = rows!(&mut *self.tx;
-            "SELECT seq, name FROM clips WHERE vehicle = $1 AND state <> 'stored'
-             ORDER BY seq LIMIT $2";
-            vehicle, above);
+        let rows: Vec<(i64, String)> = rows!(self; "SELECT seq, name FROM clips
+             WHERE vehicle = $1 AND state <> 'stored' ORDER BY seq LIMIT $2"; vehicle, above);
         for (seq, name) in &rows {
-            self.note_removed(vehicle, name, true).await?;
-            run!(&mut *self.tx; "DELETE FROM clip_words WHERE clip = $1"; seq);
-            run!(&mut *self.tx; "DELETE FROM clips WHERE seq = $1"; seq);
+            self.forget_clip(*seq, vehicle, name).await?;
         }
         tracing::warn!(vehicle, clips = above, "the oldest clips of a vehicle were forgotten");
         Ok(())

@@ -8,7 +8,7 @@ use gleaner_fleet::waves::WavePlan;
 use gleaner_protocol::vehicle_api::GrantStatus;
 
 use super::vehicles::json;
-use super::wants::{ChangedVehicles, TextMap, map};
+use super::wants::{ChangedVehicles, TextMap};
 use super::waves::ReleaseChoice;
 use super::{ChangeAuthor, CloudStore, StoreChange, int, now, now_ms, unsigned};
 use crate::error::{CloudError, CloudResult};
@@ -22,7 +22,6 @@ const RELEASES_MAX: i64 = 8;
 /// The state of a release that is open to all its vehicles.
 pub(super) const COMPLETE: &str = "complete";
 
-/// A deployment that was sent, with its revisions.
 #[derive(Debug, Clone)]
 pub(crate) struct OfferedDeployment {
     pub(crate) id: String,
@@ -67,24 +66,23 @@ impl CloudStore {
             let message = format!("deployment `{id}` has release {stored}; this is {release}");
             return Err(CloudError::denied(message, "sign it again with a higher release"));
         }
-        let (count,): (i64,) = one!(&mut *change.tx; "SELECT COUNT(*) FROM deployments");
+        let count: i64 = one!(change; "SELECT COUNT(*) FROM deployments");
         if before.is_none() && count >= DEPLOYMENTS_MAX {
             let message = format!("the fleet has {count} deployments; no more are stored");
             return Err(CloudError::denied(message, "remove some that are not needed any more"));
         }
         for (digest, envelope) in &offered.revisions {
-            run!(&mut *change.tx;
-                "INSERT INTO revisions (digest, envelope) VALUES ($1, $2)
-                 ON CONFLICT (digest) DO NOTHING";
-                digest, envelope);
+            run!(change; "INSERT INTO revisions (digest, envelope)
+                 VALUES ($1, $2) ON CONFLICT (digest) DO NOTHING"; digest, envelope);
         }
-        run!(&mut *change.tx;
-            "INSERT INTO deployments (id, is_wanted) VALUES ($1, 1)
-             ON CONFLICT (id) DO UPDATE SET is_wanted = 1";
-            id);
+        run!(change; "INSERT INTO deployments (id, is_wanted)
+             VALUES ($1, 1) ON CONFLICT (id) DO UPDATE SET is_wanted = 1"; id);
         let number = change.note(author.name, &format!("deploy release {release}"), id).await?;
-        change.keep_answer(author, &number.to_string()).await?;
-        if before.as_ref().is_some_and(|before| before.is_wanted == 0) {
+        if let Some(key) = author.key {
+            run!(change; "UPDATE request_keys SET answer = $3 WHERE actor = $1 AND name = $2";
+                author.user, &key.name, number.to_string());
+        }
+        if before.as_ref().is_some_and(|before| !before.is_wanted) {
             change.restart_wave(id).await?;
         }
         if !is_same {
@@ -105,19 +103,16 @@ impl CloudStore {
         let author = author.into();
         let mut change = self.change().await?;
         change.expect(author, id).await?;
-        if is_wanted && change.newest(id).await?.is_some_and(|it| it.is_wanted == 0) {
+        if is_wanted && change.newest(id).await?.is_some_and(|it| !it.is_wanted) {
             change.restart_wave(id).await?;
         }
         if is_wanted {
             // As for a fallback: a number that is above all before.
-            run!(&mut *change.tx;
-                "UPDATE releases SET start_request =
-                 CASE WHEN start_request < $2 THEN $2 ELSE start_request + 1 END
-                 WHERE deployment = $1";
-                id, now_ms());
+            run!(change; "UPDATE releases SET start_request = CASE WHEN start_request < $2
+                 THEN $2 ELSE start_request + 1 END WHERE deployment = $1"; id, now_ms());
         }
         let sql = "UPDATE deployments SET is_wanted = $2 WHERE id = $1";
-        let found = run!(&mut *change.tx; sql; id, i64::from(is_wanted)).rows_affected();
+        let found = run!(change; sql; id, is_wanted).rows_affected();
         change.finish(found, author.name, if is_wanted { "start" } else { "stop" }, id).await
     }
 
@@ -148,9 +143,9 @@ impl CloudStore {
         let author = author.into();
         let mut change = self.change().await?;
         change.expect(author, id).await?;
-        run!(&mut *change.tx; "DELETE FROM wave_members WHERE deployment = $1"; id);
-        run!(&mut *change.tx; "DELETE FROM releases WHERE deployment = $1"; id);
-        let found = run!(&mut *change.tx; "DELETE FROM deployments WHERE id = $1"; id);
+        run!(change; "DELETE FROM wave_members WHERE deployment = $1"; id);
+        run!(change; "DELETE FROM releases WHERE deployment = $1"; id);
+        let found = run!(change; "DELETE FROM deployments WHERE id = $1"; id);
         let found = found.rows_affected();
         change.finish(found, author.name, "remove deployment", id).await
     }
@@ -185,9 +180,8 @@ impl CloudStore {
                 _ => release.count(&mut tx, true).await?,
             };
             let waves = release.progress(&reached)?;
-            let others: Vec<(String,)> = rows!(&mut *tx;
-                "SELECT DISTINCT selector FROM releases WHERE deployment = $1 AND number <> $2";
-                &release.deployment, release.number);
+            let older_selectors = rows!(&mut *tx; "SELECT DISTINCT selector FROM releases
+                 WHERE deployment = $1 AND number <> $2"; &release.deployment, release.number);
             deployments.push(FleetDeployment {
                 version: release.version(),
                 id: release.deployment,
@@ -195,10 +189,10 @@ impl CloudStore {
                 envelope: release.sha256,
                 revision: release.revision,
                 fallback: (!release.fallback.is_empty()).then_some(release.fallback),
-                grants: serde_json::from_str(&release.grants).unwrap_or_default(),
-                selector: map(&release.selector),
-                older_selectors: others.iter().map(|(selector,)| map(selector)).collect(),
-                is_wanted: release.is_wanted != 0,
+                grants: release.grants,
+                selector: release.selector,
+                older_selectors,
+                is_wanted: release.is_wanted,
                 vehicles: all.vehicles,
                 running: all.running,
                 failed: reached.failed,
@@ -215,27 +209,23 @@ impl CloudStore {
         id: &str,
         most: i64,
     ) -> CloudResult<Vec<ReportedRelease>> {
-        let rows: Vec<(String, i64)> = rows!(&self.pool;
-            "SELECT vehicle, number FROM reported JOIN vehicles ON name = vehicle
-             WHERE deployment = $1 AND number > 0 AND is_revoked = 0
-             ORDER BY number DESC, vehicle LIMIT $2";
-            id, most);
-        let release = |(vehicle, number)| ReportedRelease { vehicle, release: unsigned(number) };
+        let rows: Vec<(String, u64)> = rows!(self; "SELECT vehicle, number
+             FROM reported JOIN vehicles ON name = vehicle WHERE deployment = $1
+             AND number > 0 AND is_revoked = 0 ORDER BY number DESC, vehicle LIMIT $2"; id, most);
+        let release = |(vehicle, release)| ReportedRelease { vehicle, release };
         Ok(rows.into_iter().map(release).collect())
     }
 
-    /// Returns the envelope of the newest release of a deployment.
     pub(crate) async fn newest_envelope(&self, id: &str) -> CloudResult<String> {
-        let row: Option<(String,)> = row!(&self.pool;
+        let envelope: Option<String> = row!(self;
             "SELECT envelope FROM releases WHERE deployment = $1 ORDER BY number DESC LIMIT 1"; id);
-        row.map(|(envelope,)| envelope).ok_or_else(|| unknown(id))
+        envelope.ok_or_else(|| unknown(id))
     }
 
     pub(crate) async fn envelope(&self, sha256: &str) -> CloudResult<Option<String>> {
         Ok(self.envelopes.find(sha256).await?.map(|(_, envelope)| envelope))
     }
 
-    /// Returns the envelope of a revision with this digest.
     pub(crate) async fn revision(&self, digest: &str) -> CloudResult<Option<String>> {
         Ok(self.revisions.find(digest).await?.map(|(_, envelope)| envelope))
     }
@@ -245,8 +235,7 @@ impl StoreChange<'_> {
     /// Adds a release, and opens it to its vehicles, or its first wave.
     async fn add_release(&mut self, offered: &OfferedDeployment, sha256: &str) -> CloudResult<()> {
         let OfferedDeployment { id, release, envelope, waves, .. } = offered;
-        let (count,): (i64,) =
-            one!(&mut *self.tx; "SELECT COUNT(*) FROM releases WHERE deployment = $1"; id);
+        let count: i64 = one!(self; "SELECT COUNT(*) FROM releases WHERE deployment = $1"; id);
         if waves.is_some() && count >= RELEASES_MAX {
             let message = format!(
                 "deployment `{id}` has {count} releases, and only the oldest can be open to all"
@@ -254,15 +243,13 @@ impl StoreChange<'_> {
             return Err(CloudError::denied(message, "deploy this one without waves"));
         }
         // The waves of an older release go on no more: vehicles that have it get this one, too.
-        run!(&mut *self.tx;
-            "UPDATE releases SET state = 'aborted', since = $2, reason = 'as a newer release came'
-             WHERE deployment = $1 AND state IN ('running', 'paused')";
-            id, now());
-        run!(&mut *self.tx;
-            "INSERT INTO releases (deployment, number, sha256, envelope, revision, fallback,
-             grants, selector, rollback_request, state, plan)
+        run!(self; "UPDATE releases
+             SET state = 'aborted', since = $2, reason = 'as a newer release came'
+             WHERE deployment = $1 AND state IN ('running', 'paused')"; id, now());
+        run!(self; "INSERT INTO releases (deployment, number,
+             sha256, envelope, revision, fallback, grants, selector, rollback_request, state, plan)
              VALUES ($1, $2, $3, $4, $5, $6, $7, $8, 0, 'running', $9)";
-            id, int(*release), sha256, envelope, &offered.revision,
+            id, release, sha256, envelope, &offered.revision,
             offered.fallback.as_deref().unwrap_or_default(), json(&offered.grants),
             json(&offered.selector), waves.as_ref().map(json).unwrap_or_default());
         match waves {
@@ -280,13 +267,11 @@ impl StoreChange<'_> {
     ) -> CloudResult<()> {
         // Numbers are times: a request is new also for a vehicle that followed one of a deployment
         // of this id that was removed since, or that a restored backup does not have.
-        run!(&mut *self.tx;
+        run!(self;
             "UPDATE releases SET rollback_request =
              CASE WHEN rollback_request < $3 THEN $3 ELSE rollback_request + 1 END
-             WHERE deployment = $1 AND number = $2";
-            id, number, now_ms());
-        run!(&mut *self.tx;
-            "UPDATE releases SET state = 'aborted', since = $3, reason = $4
+             WHERE deployment = $1 AND number = $2"; id, number, now_ms());
+        run!(self; "UPDATE releases SET state = 'aborted', since = $3, reason = $4
              WHERE deployment = $1 AND number = $2 AND state <> 'complete'";
             id, number, now(), reason);
         Ok(())

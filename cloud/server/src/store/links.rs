@@ -11,9 +11,8 @@ use super::numbers::check_number;
 use super::vehicles::{FAILED, PENDING, RUNNING, ended, json};
 use super::wants::{WishedVehicle, map};
 use super::writer::{DOUBLE, GroupVehicles, VehicleWrite, Waiting, WaitingWrite, counting};
-use super::{CloudStore, StoreChange, int, now, now_ms, parts, unsigned};
+use super::{CloudStore, StoreChange, int, now, now_ms, unsigned};
 use crate::error::{CloudError, CloudResult};
-use crate::sqlx::{self, AssertSqlSafe};
 
 /// Maximum number of deployments in a report that count.
 const DEPLOYMENTS_MAX: usize = 1000;
@@ -29,7 +28,6 @@ pub(crate) struct VehicleReport {
     /// The state of each deployment that it has or refuses, by its id and the SHA-256 of its
     /// envelope.
     pub(crate) states: BTreeMap<(String, String), DeploymentState>,
-    /// Number of the deployments that it has.
     pub(crate) deployments: u64,
     /// The status, as JSON.
     pub(crate) status: String,
@@ -112,15 +110,12 @@ fn state(deployment: &DeploymentStatus) -> DeploymentState {
 }
 
 pub(super) struct ConnectWrite {
-    name: String,
     certificate: String,
     version: String,
     key: String,
     /// Number of the newest wanted state that it has followed.
     followed: u64,
-    /// Boot of its machine.
     boot: String,
-    /// The process that has the connection.
     replica: String,
 }
 
@@ -129,15 +124,10 @@ impl VehicleWrite for ConnectWrite {
     type Done = (u64, Vec<Cursor>);
 
     const WAITING: fn(Waiting<Self>) -> WaitingWrite = WaitingWrite::Connect;
-
-    fn vehicle(&self) -> &str {
-        &self.name
-    }
 }
 
 /// A report to store, if the connection still counts.
 pub(super) struct ReportWrite {
-    name: String,
     epoch: u64,
     report: VehicleReport,
 }
@@ -147,10 +137,6 @@ impl VehicleWrite for ReportWrite {
     type Done = bool;
 
     const WAITING: fn(Waiting<Self>) -> WaitingWrite = WaitingWrite::Report;
-
-    fn vehicle(&self) -> &str {
-        &self.name
-    }
 }
 
 impl CloudStore {
@@ -165,11 +151,15 @@ impl CloudStore {
     ) -> CloudResult<(u64, Vec<Cursor>)> {
         // It is counted up.
         check_number("twice the followed wanted state", hello.followed.saturating_mul(2))?;
-        let (name, certificate) = (name.to_owned(), certificate.to_owned());
-        let (version, key) = (excerpt(&hello.version), excerpt(&hello.key));
-        let (followed, boot) = (hello.followed, excerpt(&hello.boot));
-        let replica = self.replica().to_owned();
-        self.write(ConnectWrite { name, certificate, version, key, followed, boot, replica }).await
+        let write = ConnectWrite {
+            certificate: certificate.to_owned(),
+            version: excerpt(&hello.version),
+            key: excerpt(&hello.key),
+            followed: hello.followed,
+            boot: excerpt(&hello.boot),
+            replica: self.replica().to_owned(),
+        };
+        self.write(name, write).await
     }
 
     /// Stores a report, if the connection still counts; returns whether the vehicle's wanted state
@@ -181,7 +171,7 @@ impl CloudStore {
         report: VehicleReport,
     ) -> CloudResult<bool> {
         report.check_numbers()?;
-        self.write(ReportWrite { name: name.to_owned(), epoch, report }).await
+        self.write(name, ReportWrite { epoch, report }).await
     }
 }
 
@@ -202,13 +192,14 @@ impl StoreChange<'_> {
         vehicles: &mut GroupVehicles,
         connects: &mut [&mut Waiting<ConnectWrite>],
     ) -> CloudResult<()> {
-        let names: Vec<_> = connects.iter().map(|it| &*it.write.name).collect();
+        let names: Vec<_> = connects.iter().map(|it| &*it.vehicle).collect();
         let mut certificates = self.certificates_of(&names).await?;
         let mut replaced = Vec::new();
         // The newest connection of each vehicle.
         let mut begun = BTreeMap::new();
         for waiting in connects.iter_mut() {
-            let ConnectWrite { name, certificate, followed, boot, .. } = &waiting.write;
+            let ConnectWrite { certificate, followed, boot, .. } = &waiting.write;
+            let name = &waiting.vehicle;
             let all = certificates.entry(name.clone()).or_default();
             let used = all.iter().find(|(sha256, _)| sha256 == certificate);
             let expires = used.map(|(_, expires)| *expires).filter(|expires| *expires > now());
@@ -223,8 +214,8 @@ impl StoreChange<'_> {
                 continue;
             }
             // Used, a certificate is durable on the vehicle, and replaces the former ones.
-            replaced
-                .extend(all.extract_if(.., |(_, end)| *end < expires).map(|(sha256, _)| sha256));
+            let former = all.extract_if(.., |(_, end)| *end < expires);
+            replaced.extend(former.map(|(sha256, _)| sha256));
             vehicle.epoch += 1;
             if int(*followed) > vehicle.offered {
                 // Also if others have counted the number meanwhile: it stands for another state.
@@ -239,43 +230,30 @@ impl StoreChange<'_> {
         let mut cursors = self.cursors_of(&begun.keys().collect::<Vec<_>>()).await?;
         let mut rows = Vec::new();
         for waiting in connects.iter_mut() {
-            let ConnectWrite { name, version, key, replica, .. } = &waiting.write;
+            let (name, write) = (&waiting.vehicle, &waiting.write);
             let Some(Ok((epoch, positions))) = &mut waiting.result else { continue };
-            if let Some(vehicle) = begun.get(name).filter(|it| it.epoch == int(*epoch)) {
+            if let Some(it) = begun.get(name).filter(|it| it.epoch == int(*epoch)) {
                 *positions = cursors.remove(name).unwrap_or_default();
-                let [boot, former] = &vehicle.boots;
-                rows.push((name, vehicle, [version, key, replica, boot, former]));
+                rows.push(values! {
+                    name, it.epoch, it.generation, it.offered, it.is_ahead, it.is_double,
+                    &write.version, &write.key, &write.replica, &it.boot, &it.former_boot, now()
+                });
             }
         }
-        for part in parts(&rows) {
-            let sql = format!(
-                "INSERT INTO vehicles
-                 (name, epoch, generation, offered, is_ahead, is_double, version, clip_key, replica,
-                 boot, former_boot, seen) VALUES {} ON CONFLICT (name) DO UPDATE SET epoch = excluded.epoch,
-                 generation = excluded.generation, offered = excluded.offered,
-                 is_ahead = excluded.is_ahead, is_double = excluded.is_double,
-                 boot = excluded.boot, former_boot = excluded.former_boot, version = excluded.version, clip_key = excluded.clip_key,
-                 replica = excluded.replica, seen = excluded.seen",
-                self.placeholders(part.len(), 12)
-            );
-            let mut query = sqlx::query(AssertSqlSafe(sql));
-            for (name, it, texts) in part {
-                query = query.bind(*name).bind(it.epoch).bind(it.generation).bind(it.offered);
-                query = query.bind(it.is_ahead).bind(it.is_double);
-                query = texts.iter().fold(query, |query, text| query.bind(*text)).bind(now());
-            }
-            query.execute(&mut *self.tx).await?;
-        }
+        let others = "epoch, generation, offered, is_ahead, is_double, version, clip_key, replica, \
+                      boot, former_boot, seen";
+        self.upsert(("vehicles", "name", others), &rows).await?;
         let doubles = begun.iter().filter(|(_, it)| it.is_double == DOUBLE);
         let doubles: Vec<_> = doubles.map(|(name, _)| name).collect();
-        self.run_in("UPDATE vehicles SET is_double = 2 WHERE name IN", &doubles).await?;
-        self.run_in("DELETE FROM certificates WHERE sha256 IN", &replaced).await
+        self.run_in("UPDATE vehicles SET is_double = 2 WHERE name IN ($1..)", &doubles, &[])
+            .await?;
+        self.run_in("DELETE FROM certificates WHERE sha256 IN ($1..)", &replaced, &[]).await
     }
 
     async fn certificates_of(&mut self, names: &[&str]) -> CloudResult<Certificates> {
         let mut certificates = Certificates::new();
-        let rows: Vec<(String, String, i64)> = rows_in!(&mut *self.tx;
-            "SELECT vehicle, sha256, expires FROM certificates WHERE vehicle IN ()"; names);
+        let rows: Vec<(String, String, i64)> = rows_in!(self;
+            "SELECT vehicle, sha256, expires FROM certificates WHERE vehicle IN ($1..)"; names);
         for (vehicle, sha256, expires) in rows {
             certificates.entry(vehicle).or_default().push((sha256, expires));
         }
@@ -287,7 +265,6 @@ impl StoreChange<'_> {
         Ok(certificates)
     }
 
-    /// Stores reports of connections that still count.
     pub(super) async fn report_all(
         &mut self,
         vehicles: &mut GroupVehicles,
@@ -297,7 +274,7 @@ impl StoreChange<'_> {
         // The newest report of each vehicle; states are new if those of any report are.
         let mut rows: BTreeMap<&str, (&VehicleReport, bool)> = BTreeMap::new();
         for waiting in reports.iter_mut() {
-            let ReportWrite { name, epoch, report } = &mut waiting.write;
+            let (name, ReportWrite { epoch, report }) = (&waiting.vehicle, &mut waiting.write);
             let vehicle = match counting(vehicles, name, int(*epoch)) {
                 Ok(vehicle) => vehicle,
                 Err(error) => {
@@ -315,72 +292,38 @@ impl StoreChange<'_> {
                 relabeled.push(WishedVehicle { name: name.clone(), labels, digest });
             }
         }
-        let rows: Vec<_> = rows.into_iter().collect();
-        self.store_reports(&rows).await?;
-        let changed: Vec<_> = rows.iter().filter(|(_, (_, is_new))| *is_new).collect();
-        self.store_states(&changed.iter().map(|(name, (it, _))| (*name, *it)).collect::<Vec<_>>())
-            .await?;
+        let all = rows.iter().map(|(name, (report, _))| {
+            let running = report.states.values().filter(|it| it.state == RUNNING).count();
+            values! {
+                *name, report.handled, json(&report.problems), &report.status, now_ms(),
+                json(&report.labels), report.deployments, running, &report.version
+            }
+        });
+        let others =
+            "handled, problems, status, reported_ms, labels, deployments, running, version";
+        self.upsert(("vehicles", "name", others), &all.collect::<Vec<_>>()).await?;
+        let changed = rows.into_iter().filter(|(_, (_, is_new))| *is_new);
+        let changed: Vec<_> = changed.map(|(name, (report, _))| (name, report)).collect();
+        self.store_states(&changed).await?;
         let changed = self.refresh(relabeled).await?;
         for waiting in reports.iter_mut() {
             if let Some(Ok(has_changed)) = &mut waiting.result {
-                *has_changed = changed.contains(&waiting.write.name);
+                *has_changed = changed.contains(&waiting.vehicle);
             }
-        }
-        Ok(())
-    }
-
-    async fn store_reports(&mut self, rows: &[(&str, (&VehicleReport, bool))]) -> CloudResult<()> {
-        for part in parts(rows) {
-            let sql = format!(
-                "INSERT INTO vehicles
-                 (name, handled, problems, status, reported_ms, labels, deployments, running,
-                 version)
-                 VALUES {} ON CONFLICT (name) DO UPDATE SET handled = excluded.handled,
-                 problems = excluded.problems, status = excluded.status,
-                 reported_ms = excluded.reported_ms, labels = excluded.labels,
-                 deployments = excluded.deployments, running = excluded.running,
-                 version = excluded.version",
-                self.placeholders(part.len(), 9)
-            );
-            let mut query = sqlx::query(AssertSqlSafe(sql));
-            for (name, (report, _)) in part {
-                let states = report.states.values();
-                let running = states.filter(|it| it.state == RUNNING).count();
-                query = query
-                    .bind(*name)
-                    .bind(int(report.handled))
-                    .bind(json(&report.problems))
-                    .bind(&report.status)
-                    .bind(now_ms())
-                    .bind(json(&report.labels))
-                    .bind(int(report.deployments))
-                    .bind(int(running as u64))
-                    .bind(&report.version);
-            }
-            query.execute(&mut *self.tx).await?;
         }
         Ok(())
     }
 
     async fn store_states(&mut self, reports: &[(&str, &VehicleReport)]) -> CloudResult<()> {
         let names: Vec<_> = reports.iter().map(|(name, _)| *name).collect();
-        self.run_in("DELETE FROM reported WHERE vehicle IN", &names).await?;
+        self.run_in("DELETE FROM reported WHERE vehicle IN ($1..)", &names, &[]).await?;
         let states = reports.iter().flat_map(|(name, report)| {
-            report.states.iter().map(move |(key, state)| (*name, key, state))
+            report.states.iter().map(move |((id, envelope), it)| {
+                values! { *name, id, envelope, it.release, it.state, &it.reason, it.on_fallback }
+            })
         });
-        for part in parts(&states.collect::<Vec<_>>()) {
-            let sql = format!(
-                "INSERT INTO reported (vehicle, deployment, envelope, number, state, reason,
-                 on_fallback) VALUES {}",
-                self.placeholders(part.len(), 7)
-            );
-            let mut query = sqlx::query(AssertSqlSafe(sql));
-            for (name, (id, envelope), it) in part {
-                query = query.bind(*name).bind(id).bind(envelope).bind(int(it.release));
-                query = query.bind(it.state).bind(&it.reason).bind(i64::from(it.on_fallback));
-            }
-            query.execute(&mut *self.tx).await?;
-        }
-        Ok(())
+        let sql = "INSERT INTO reported
+                   (vehicle, deployment, envelope, number, state, reason, on_fallback) VALUES ()";
+        self.insert::<i64, 7>(sql, &states.collect::<Vec<_>>()).await.map(drop)
     }
 }

@@ -7,28 +7,26 @@ use std::collections::{BTreeSet, HashMap};
 use tokio::sync::{mpsc, oneshot};
 
 use super::writer::stopped;
-use super::{in_list, list_parts};
 use crate::error::CloudResult;
-use crate::sqlx::{self, AnyPool, AssertSqlSafe};
+use crate::sqlx::AnyPool;
 
-/// Maximum number of lookups in a query.
 const GROUP_MAX: usize = 256;
 
 /// The certificates, with their ends and vehicles.
 pub(super) const CERTIFICATES: &str = "SELECT sha256, expires, vehicles.name FROM certificates
-     JOIN vehicles ON vehicles.name = certificates.vehicle WHERE is_revoked = 0 AND sha256 IN";
+     JOIN vehicles ON vehicles.name = certificates.vehicle
+     WHERE is_revoked = 0 AND sha256 IN ($1..)";
 /// The vehicles, with the numbers and digests of their wanted states; after the digest, [`AHEAD`]
 /// of one that has followed a newer state.
 pub(super) const WANTS: &str = "SELECT name, generation,
      CASE WHEN is_ahead = 0 THEN digest ELSE digest || ' ahead' END
-     FROM vehicles WHERE is_revoked = 0 AND name IN";
+     FROM vehicles WHERE is_revoked = 0 AND name IN ($1..)";
 pub(super) const AHEAD: &str = " ahead";
-/// The envelopes of deployments.
-pub(super) const ENVELOPES: &str = "SELECT sha256, number, envelope FROM releases WHERE sha256 IN";
+pub(super) const ENVELOPES: &str =
+    "SELECT sha256, number, envelope FROM releases WHERE sha256 IN ($1..)";
 pub(super) const REVISIONS: &str =
-    "SELECT digest, unused_since, envelope FROM revisions WHERE digest IN";
+    "SELECT digest, unused_since, envelope FROM revisions WHERE digest IN ($1..)";
 
-/// The number and the text of a key.
 type FoundRow = (i64, String);
 
 struct Lookup {
@@ -36,12 +34,11 @@ struct Lookup {
     reply: oneshot::Sender<CloudResult<Option<FoundRow>>>,
 }
 
-/// The queue of the lookups of one kind.
 pub(super) struct LookupQueue(mpsc::Sender<Lookup>);
 
 impl LookupQueue {
     /// Starts the task that looks up, which ends with the queue. `sql` is a query of a key, a
-    /// number and a text, up to the list of keys.
+    /// number and a text.
     pub(super) fn start(pool: &AnyPool, sql: &'static str) -> Self {
         let (queue, waiting) = mpsc::channel(GROUP_MAX);
         tokio::spawn(run(pool.clone(), sql, waiting));
@@ -61,7 +58,7 @@ async fn run(pool: AnyPool, sql: &'static str, mut waiting: mpsc::Receiver<Looku
     let mut group = Vec::new();
     while waiting.recv_many(&mut group, GROUP_MAX).await > 0 {
         let keys: BTreeSet<_> = group.iter().map(|lookup| &*lookup.key).collect();
-        let found = found(&pool, sql, &keys.into_iter().collect::<Vec<_>>()).await;
+        let found = found(pool.clone(), sql, &keys.into_iter().collect::<Vec<_>>()).await;
         for Lookup { key, reply } in group.drain(..) {
             // The connection may have ended meanwhile.
             let _ = reply.send(match &found {
@@ -72,14 +69,7 @@ async fn run(pool: AnyPool, sql: &'static str, mut waiting: mpsc::Receiver<Looku
     }
 }
 
-async fn found(pool: &AnyPool, sql: &str, keys: &[&str]) -> CloudResult<HashMap<String, FoundRow>> {
-    let mut rows = HashMap::with_capacity(keys.len());
-    for part in list_parts(keys) {
-        let sql = format!("{sql} ({})", in_list(part.len()));
-        let query = sqlx::query_as::<_, (String, i64, String)>(AssertSqlSafe(sql));
-        let query = part.iter().fold(query, |query, key| query.bind(*key));
-        let all = query.fetch_all(pool).await?;
-        rows.extend(all.into_iter().map(|(key, number, text)| (key, (number, text))));
-    }
-    Ok(rows)
+async fn found(pool: AnyPool, sql: &str, keys: &[&str]) -> CloudResult<HashMap<String, FoundRow>> {
+    let rows: Vec<(String, i64, String)> = rows_in!(&pool; sql; keys);
+    Ok(rows.into_iter().map(|(key, number, text)| (key, (number, text))).collect())
 }

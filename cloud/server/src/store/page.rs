@@ -3,10 +3,10 @@
 use std::collections::BTreeMap;
 
 use gleaner_fleet::people::{VehicleState, VehicleSummary};
-use gleaner_protocol::vehicle_api::StreamLine;
 
-use super::vehicles::{FAILED, VehicleRow, summary, vehicle_columns, vehicle_state};
-use super::{CloudStore, int, name_in_lines, unsigned};
+use super::CloudStore;
+use super::records::line_of;
+use super::vehicles::{FAILED, json, vehicle_state, vehicle_summary};
 use crate::error::CloudResult;
 
 /// Longest line that is shown, in bytes: a page has a thousand at most.
@@ -29,7 +29,16 @@ pub(crate) struct VehicleFilter {
     pub(crate) has_problem: bool,
 }
 
-/// A part of the vehicles, with numbers of all.
+typed! {
+    /// Values that a filter looks at.
+    struct FilteredVehicle {
+        name: String,
+        has_problems: bool,
+        labels: String,
+        state: VehicleState,
+    }
+}
+
 #[derive(Debug, Default)]
 pub(crate) struct VehiclePage {
     /// Those of this part, with the number of failed deployments of each.
@@ -42,7 +51,6 @@ pub(crate) struct VehiclePage {
     pub(crate) with_problems: usize,
 }
 
-/// The newest records of some streams.
 #[derive(Debug, Default)]
 pub(crate) struct NewestRecords {
     /// Number of the arrival and the line of each, the newest first.
@@ -64,12 +72,9 @@ impl NewestRecords {
 impl CloudStore {
     /// Returns the numbers of vehicles, and of releases, by their states.
     pub(crate) async fn states(&self) -> CloudResult<(Vec<(String, i64)>, Vec<(String, i64)>)> {
-        let vehicles = rows!(&self.pool;
-            "SELECT CASE WHEN is_revoked <> 0 THEN 'revoked'
-             WHEN replica IN (SELECT id FROM replicas) THEN 'online'
-             WHEN epoch = 0 THEN 'invited' ELSE 'offline' END AS state, COUNT(*)
-             FROM vehicles GROUP BY 1");
-        let releases = rows!(&self.pool; "SELECT state, COUNT(*) FROM releases GROUP BY state");
+        let vehicles = rows!(self;
+            concat!("SELECT ", vehicle_state!(), ", COUNT(*) FROM vehicles GROUP BY 1"));
+        let releases = rows!(self; "SELECT state, COUNT(*) FROM releases GROUP BY state");
         Ok((vehicles, releases))
     }
 
@@ -81,25 +86,26 @@ impl CloudStore {
         size: usize,
     ) -> CloudResult<VehiclePage> {
         // Of all vehicles, only what the filters look at: texts of thousands take their time.
-        let rows: Vec<(String, i64, i64, i64, i64, String)> = rows!(&self.pool;
-            "SELECT name, is_revoked, epoch,
-             CASE WHEN replica IN (SELECT id FROM replicas) THEN 1 ELSE 0 END,
-             CASE WHEN problems = '[]' THEN 0 ELSE 1 END,
-             CASE WHEN $2 = 0 THEN '' ELSE labels END
-             FROM vehicles WHERE $1 = '' OR name = $1 ORDER BY name";
-            &filter.only, i64::from(filter.label.is_some()));
-        let failed: Vec<(String, i64)> = rows!(&self.pool;
-            "SELECT vehicle, COUNT(*) FROM reported WHERE state = $1 AND ($2 = '' OR vehicle = $2)
-             GROUP BY vehicle";
-            FAILED, &filter.only);
-        let failed: BTreeMap<String, i64> = failed.into_iter().collect();
+        let rows: Vec<FilteredVehicle> = rows!(self;
+            concat!("SELECT name, CASE WHEN problems = '[]' THEN 0 ELSE 1 END AS has_problems,
+             CASE WHEN $2 = 0 THEN '' ELSE labels END AS labels, ", vehicle_state!(),
+             " FROM vehicles WHERE $1 = '' OR name = $1 ORDER BY name");
+            &filter.only, filter.label.is_some());
+        let failed: Vec<(String, u64)> = rows!(self; "SELECT vehicle, COUNT(*) FROM reported WHERE
+             state = $1 AND ($2 = '' OR vehicle = $2) GROUP BY vehicle"; FAILED, &filter.only);
+        let failed: BTreeMap<_, _> = failed.into_iter().collect();
         let mut page = VehiclePage::default();
         let mut names = Vec::new();
-        for (name, is_revoked, epoch, is_online, problems, labels) in rows {
-            let state = vehicle_state(is_revoked, epoch, is_online);
-            let failures = failed.get(&name).map_or(0, |count| unsigned(*count));
-            let has_problem = state != VehicleState::Revoked && (problems != 0 || failures > 0);
-            page.states[state_index(state)] += 1;
+        for FilteredVehicle { name, has_problems, labels, state } in rows {
+            let failures = failed.get(&name).copied().unwrap_or(0);
+            let has_problem = state != VehicleState::Revoked && (has_problems || failures > 0);
+            let index_of = match state {
+                VehicleState::Online => 0,
+                VehicleState::Offline => 1,
+                VehicleState::Invited => 2,
+                VehicleState::Revoked => 3,
+            };
+            page.states[index_of] += 1;
             page.with_problems += usize::from(has_problem);
             let is_chosen = filter.state.is_none_or(|wanted| wanted == state)
                 && (has_problem || !filter.has_problem)
@@ -114,9 +120,9 @@ impl CloudStore {
             page.found += 1;
         }
         for (name, failures) in names {
-            let row: Option<VehicleRow> =
-                row!(&self.pool; concat!(vehicle_columns!(), " WHERE name = $1"); &name);
-            page.vehicles.extend(row.map(|row| (summary(row), failures)));
+            let row: Option<VehicleSummary> =
+                row!(self; vehicle_summary!("WHERE name = $1"); &name);
+            page.vehicles.extend(row.map(|row| (row, failures)));
         }
         Ok(page)
     }
@@ -130,7 +136,7 @@ impl CloudStore {
         envelope: &str,
         most: i64,
     ) -> CloudResult<Vec<(String, String, String)>> {
-        Ok(rows!(&self.pool;
+        Ok(rows!(self;
             "SELECT vehicle, CASE WHEN on_fallback = 1 THEN 'fallback' ELSE state END, reason
              FROM reported WHERE deployment = $1 AND envelope = $2
              ORDER BY CASE WHEN state = $3 THEN 0 ELSE 1 END, vehicle LIMIT $4";
@@ -145,11 +151,9 @@ impl CloudStore {
         name: &str,
         is_included: bool,
     ) -> CloudResult<Vec<(String, bool)>> {
-        let rows: Vec<(String, String)> = rows!(&self.pool;
-            "SELECT name, labels FROM vehicles
-             WHERE (name > $1 OR (name = $1 AND $2 = 1)) AND ($3 = '' OR name = $3)
-             ORDER BY name LIMIT $4";
-            name, i64::from(is_included), &filter.only, VEHICLES_AT_ONCE);
+        let rows: Vec<(String, String)> = rows!(self; "SELECT name, labels
+             FROM vehicles WHERE (name > $1 OR (name = $1 AND $2 = 1)) AND ($3 = '' OR name = $3)
+             ORDER BY name LIMIT $4"; name, is_included, &filter.only, VEHICLES_AT_ONCE);
         let chosen = |(name, labels): (String, String)| {
             let is_chosen = filter.has(&labels);
             (name, is_chosen)
@@ -164,11 +168,8 @@ impl CloudStore {
         first: &str,
         most: usize,
     ) -> CloudResult<Vec<String>> {
-        let rows: Vec<(String,)> = rows!(&self.pool;
-            "SELECT stream FROM streams WHERE vehicle = $1 AND stream >= $2
-             ORDER BY stream LIMIT $3";
-            vehicle, first, int(most as u64));
-        Ok(rows.into_iter().map(|(stream,)| stream).collect())
+        Ok(rows!(self; "SELECT stream FROM streams WHERE vehicle = $1 AND stream >= $2 ORDER BY
+             stream LIMIT $3"; vehicle, first, most))
     }
 
     /// Returns the names of the streams of a vehicle: at most as many as one time line shows.
@@ -180,13 +181,7 @@ impl CloudStore {
 /// Returns the line of a record that is too long to show.
 pub(crate) fn large_line(stream: &str, bytes: u64) -> String {
     let text = format!("a record of {bytes} bytes is not shown here: `gleaner logs` has it");
-    let line = StreamLine {
-        stream: name_in_lines(stream).to_owned(),
-        kind: "large".to_owned(),
-        record: serde_json::json!({ "text": text }),
-        ..StreamLine::default()
-    };
-    super::vehicles::json(&line)
+    line_of(stream, "large", serde_json::json!({ "text": text }))
 }
 
 impl VehicleFilter {
@@ -200,17 +195,4 @@ impl VehicleFilter {
         // A quote after one of these begins a name: in a text, it would be escaped.
         ["{", ","].iter().any(|before| labels.contains(&format!("{before}{label}")))
     }
-}
-
-fn state_index(state: VehicleState) -> usize {
-    match state {
-        VehicleState::Online => 0,
-        VehicleState::Offline => 1,
-        VehicleState::Invited => 2,
-        VehicleState::Revoked => 3,
-    }
-}
-
-fn json(text: &str) -> String {
-    super::vehicles::json(&text)
 }

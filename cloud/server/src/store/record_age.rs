@@ -15,19 +15,16 @@ impl CloudStore {
     }
 
     pub(crate) async fn note_arrivals_on(&self, day: i64) -> CloudResult<()> {
-        let noted: Option<(i64,)> =
-            row!(&self.pool; "SELECT day FROM arrival_days WHERE day >= $1 LIMIT 1"; day);
+        let noted: Option<i64> =
+            row!(self; "SELECT day FROM arrival_days WHERE day >= $1 LIMIT 1"; day);
         if noted.is_some() {
             return Ok(());
         }
         let mut change = self.change().await?;
-        run!(&mut *change.tx;
-            "INSERT INTO arrival_days (vehicle, day, arrived)
-             SELECT name, CAST($1 AS BIGINT), arrived FROM vehicles WHERE arrived > 0
-             AND NOT EXISTS (SELECT 1 FROM arrival_days
-             WHERE arrival_days.vehicle = vehicles.name AND arrival_days.arrived = vehicles.arrived)
-             ON CONFLICT (vehicle, day) DO NOTHING";
-            day);
+        run!(change; "INSERT INTO arrival_days (vehicle, day, arrived) SELECT name,
+             CAST($1 AS BIGINT), arrived FROM vehicles WHERE arrived > 0 AND NOT EXISTS (SELECT 1
+             FROM arrival_days WHERE arrival_days.vehicle = vehicles.name AND
+             arrival_days.arrived = vehicles.arrived) ON CONFLICT (vehicle, day) DO NOTHING"; day);
         change.commit().await
     }
 
@@ -36,10 +33,8 @@ impl CloudStore {
     /// once it has been over for that long.
     pub(crate) async fn expire_records(&self, days: u32) -> CloudResult<bool> {
         let last = self.age_now() / DAY_S - i64::from(days) - 1;
-        let old: Vec<(String, i64)> = rows!(&self.pool;
-            "SELECT vehicle, MAX(arrived) FROM arrival_days WHERE day <= $1
-             GROUP BY vehicle ORDER BY vehicle LIMIT $2";
-            last, VEHICLES_AT_ONCE);
+        let old: Vec<(String, i64)> = rows!(self; "SELECT vehicle, MAX(arrived) FROM arrival_days
+             WHERE day <= $1 GROUP BY vehicle ORDER BY vehicle LIMIT $2"; last, VEHICLES_AT_ONCE);
         for (vehicle, arrived) in &old {
             self.expire_vehicle(vehicle, *arrived, last).await?;
         }
@@ -53,23 +48,20 @@ impl CloudStore {
     /// all have to be old enough.
     async fn expire_vehicle(&self, vehicle: &str, arrived: i64, day: i64) -> CloudResult<()> {
         let mut change = self.change().await?;
-        let streams: Vec<(String,)> = rows!(&mut *change.tx;
+        let streams: Vec<String> = rows!(change;
             "SELECT stream FROM streams WHERE vehicle = $1 AND kept > 0"; vehicle);
-        for (stream,) in &streams {
+        for stream in &streams {
             while change.remove_oldest_chunk((vehicle, stream), arrived).await?.is_some() {}
-            let (count, bytes): (i64, i64) = one!(&mut *change.tx;
+            let (count, bytes): (i64, i64) = one!(change;
                 "SELECT COUNT(*), CAST(COALESCE(SUM(bytes), 0) AS BIGINT) FROM records
-                 WHERE vehicle = $1 AND stream = $2 AND arrival <= $3";
-                vehicle, stream, arrived);
-            let seq: Option<(i64,)> = row!(&mut *change.tx;
-                "SELECT seq FROM records WHERE vehicle = $1 AND stream = $2 AND arrival <= $3
-                 ORDER BY arrival DESC LIMIT 1";
-                vehicle, stream, arrived);
-            let Some((seq,)) = seq else { continue };
+                 WHERE vehicle = $1 AND stream = $2 AND arrival <= $3"; vehicle, stream, arrived);
+            let seq: Option<i64> = row!(change;
+                "SELECT seq FROM records WHERE vehicle = $1 AND stream = $2
+                 AND arrival <= $3 ORDER BY arrival DESC LIMIT 1"; vehicle, stream, arrived);
+            let Some(seq) = seq else { continue };
             change.remove_rows((vehicle, stream), arrived, (count, bytes, seq)).await?;
         }
-        run!(&mut *change.tx; "DELETE FROM arrival_days WHERE vehicle = $1 AND day <= $2";
-            vehicle, day);
+        run!(change; "DELETE FROM arrival_days WHERE vehicle = $1 AND day <= $2"; vehicle, day);
         change.commit().await
     }
 }

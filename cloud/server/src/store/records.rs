@@ -2,10 +2,9 @@
 
 use gleaner_fleet::Cursor;
 use gleaner_protocol::vehicle_api::StreamLine;
-use serde_json::json;
 
-use super::vehicles::unknown;
-use super::{CloudStore, int, unsigned};
+use super::CloudStore;
+use super::vehicles::{json, unknown};
 use crate::error::CloudResult;
 
 /// Bounds of what is kept of each stream of each vehicle, and of all of them. Of records in chunks,
@@ -23,12 +22,10 @@ impl Retention {
         Retention { records: 1_000_000, bytes: 64 << 20, vehicle_bytes: 512 << 20 };
 }
 
-/// Records of a stream that a vehicle has sent.
 #[derive(Debug)]
 pub(crate) struct StreamBatch {
     /// Number, mark and text of each line; the mark is empty for records.
     pub(crate) lines: Vec<(u64, String, String)>,
-    /// The position after them.
     pub(crate) cursor: Cursor,
 }
 
@@ -40,31 +37,25 @@ pub(crate) struct RecordPage {
 }
 
 impl CloudStore {
-    /// Checks that there is such a vehicle.
-    ///
-    /// # Errors
-    ///
-    /// An error if there is none.
+    /// Fails if there is no such vehicle.
     pub(crate) async fn vehicle_exists(&self, vehicle: &str) -> CloudResult<()> {
-        let exists: Option<(String,)> =
-            row!(&self.pool; "SELECT name FROM vehicles WHERE name = $1"; vehicle);
+        let exists: Option<String> =
+            row!(self; "SELECT name FROM vehicles WHERE name = $1"; vehicle);
         exists.map(drop).ok_or_else(|| unknown(vehicle))
     }
 
     /// Returns the number of the last arrival of a vehicle: all up to it are visible.
     pub(crate) async fn arrived(&self, vehicle: &str) -> CloudResult<i64> {
-        let row: Option<(i64,)> =
-            row!(&self.pool; "SELECT arrived FROM vehicles WHERE name = $1"; vehicle);
-        Ok(row.map_or(0, |(arrived,)| arrived))
+        let arrived: Option<i64> =
+            row!(self; "SELECT arrived FROM vehicles WHERE name = $1"; vehicle);
+        Ok(arrived.unwrap_or(0))
     }
 
     /// Returns the number of records of two streams, which may be the same, in rows and in chunks.
     pub(crate) async fn kept(&self, vehicle: &str, streams: [&str; 2]) -> CloudResult<u64> {
-        let (kept,): (i64,) = one!(&self.pool;
+        Ok(one!(self;
             "SELECT CAST(COALESCE(SUM(kept), 0) AS BIGINT) FROM streams
-             WHERE vehicle = $1 AND stream IN ($2, $3)";
-            vehicle, streams[0], streams[1]);
-        Ok(unsigned(kept))
+             WHERE vehicle = $1 AND stream IN ($2, $3)"; vehicle, streams[0], streams[1]))
     }
 
     /// Returns the arrival of the oldest record of two streams, which may be the same, that has the
@@ -75,14 +66,11 @@ impl CloudStore {
         streams: [&str; 2],
         from: u64,
     ) -> CloudResult<Option<i64>> {
-        let (oldest,): (Option<i64>,) = one!(&self.pool;
-            "SELECT MIN(first) FROM (
-             SELECT MIN(first_arrival) AS first FROM chunks
-             WHERE vehicle = $1 AND stream IN ($2, $3) AND last_seq >= $4
-             UNION ALL SELECT MIN(arrival) AS first FROM records
-             WHERE vehicle = $1 AND stream IN ($2, $3) AND seq >= $4) AS ends";
-            vehicle, streams[0], streams[1], int(from));
-        Ok(oldest)
+        Ok(one!(self;
+            "SELECT MIN(first) FROM (SELECT MIN(first_arrival) AS first
+             FROM chunks WHERE vehicle = $1 AND stream IN ($2, $3) AND last_seq >= $4
+             UNION ALL SELECT MIN(arrival) AS first FROM records WHERE vehicle = $1
+             AND stream IN ($2, $3) AND seq >= $4) AS ends"; vehicle, streams[0], streams[1], from))
     }
 
     /// Returns at most `most` rows of two streams, which may be the same, that have arrived after
@@ -94,11 +82,9 @@ impl CloudStore {
         (after, from): (i64, u64),
         most: i64,
     ) -> CloudResult<Vec<(i64, String)>> {
-        Ok(rows!(&self.pool;
-            "SELECT arrival, line FROM records
-             WHERE vehicle = $1 AND stream IN ($2, $3) AND arrival > $4 AND seq >= $5
-             ORDER BY arrival LIMIT $6";
-            vehicle, streams[0], streams[1], after, int(from), most))
+        Ok(rows!(self; "SELECT arrival, line FROM records WHERE vehicle = $1 AND stream IN ($2, $3)
+             AND arrival > $4 AND seq >= $5 ORDER BY arrival LIMIT $6";
+            vehicle, streams[0], streams[1], after, from, most))
     }
 
     /// Returns a line for each of two streams, which may be the same, of which records with the
@@ -109,22 +95,21 @@ impl CloudStore {
         streams: [&str; 2],
         from: u64,
     ) -> CloudResult<Vec<String>> {
-        let rows: Vec<(String, i64, i64)> = rows!(&self.pool;
-            "SELECT stream, removed, removed_to FROM streams
-             WHERE vehicle = $1 AND stream IN ($2, $3) AND removed > 0 AND removed_to >= $4";
-            vehicle, streams[0], streams[1], int(from));
+        let rows: Vec<(String, i64, i64)> = rows!(self;
+            "SELECT stream, removed, removed_to FROM streams WHERE vehicle = $1 AND stream IN ($2,
+             $3) AND removed > 0 AND removed_to >= $4"; vehicle, streams[0], streams[1], from);
         let line = |(stream, removed, to): (String, i64, i64)| {
-            let record = json!({ "to": to, "reason": "Retention", "records": removed });
-            let line = StreamLine {
-                stream: name_in_lines(&stream).to_owned(),
-                kind: "gap".to_owned(),
-                record,
-                ..StreamLine::default()
-            };
-            serde_json::to_string(&line).unwrap_or_default()
+            let record = serde_json::json!({ "to": to, "reason": "Retention", "records": removed });
+            line_of(&stream, "gap", record)
         };
         Ok(rows.into_iter().map(line).collect())
     }
+}
+
+/// Returns a line that the cloud itself makes.
+pub(super) fn line_of(stream: &str, kind: &str, record: serde_json::Value) -> String {
+    let (stream, kind) = (name_in_lines(stream).to_owned(), kind.to_owned());
+    json(&StreamLine { stream, kind, record, ..StreamLine::default() })
 }
 
 /// Returns the name of a stream in its lines: of a lambda's records, the id of its deployment.

@@ -3,7 +3,6 @@
 use axum::http::StatusCode;
 use gleaner_fleet::people::User;
 
-use super::waves::ReleaseChoice;
 use super::{StoreChange, now};
 use crate::error::{CloudError, CloudResult};
 
@@ -50,27 +49,21 @@ impl<'r> From<&'r User> for ChangeAuthor<'r> {
 
 impl StoreChange<'_> {
     /// Begins a request with a key; returns the answer if it was carried out before.
-    ///
-    /// # Errors
-    ///
-    /// An error if another request had the key, or if the answer had a secret, which is not kept.
+    /// Fails if another request had the key, or if the answer had a secret, which is not kept.
     pub(super) async fn begin_request(
         &mut self,
         author: ChangeAuthor<'_>,
     ) -> CloudResult<Option<String>> {
         let Some(RequestKey { name, request }) = author.key else { return Ok(None) };
-        run!(&mut *self.tx; "DELETE FROM request_keys WHERE time <= $1"; now() - KEPT_S);
+        run!(self; "DELETE FROM request_keys WHERE time <= $1"; now() - KEPT_S);
         // A request at the same time waits here, or for its turn, until this one has ended.
-        let added = run!(&mut *self.tx;
-            "INSERT INTO request_keys (actor, name, request, time) VALUES ($1, $2, $3, $4)
-             ON CONFLICT (actor, name) DO NOTHING";
-            author.user, name, request, now());
+        let added = run!(self; "INSERT INTO request_keys (actor, name, request, time) VALUES ($1,
+             $2, $3, $4) ON CONFLICT (actor, name) DO NOTHING"; author.user, name, request, now());
         if added.rows_affected() > 0 {
             return Ok(None);
         }
-        let (stored, answer): (String, String) = one!(&mut *self.tx;
-            "SELECT request, answer FROM request_keys WHERE actor = $1 AND name = $2";
-            author.user, name);
+        let (stored, answer): (String, String) = one!(self; "SELECT request, answer
+             FROM request_keys WHERE actor = $1 AND name = $2"; author.user, name);
         if stored != *request {
             let message = "another request had the same `Idempotency-Key`";
             let help = "use a new key for each request, and the same one to repeat it";
@@ -84,25 +77,10 @@ impl StoreChange<'_> {
         Ok(Some(answer))
     }
 
-    pub(super) async fn keep_answer(
-        &mut self,
-        author: ChangeAuthor<'_>,
-        answer: &str,
-    ) -> CloudResult<()> {
-        if let Some(key) = author.key {
-            run!(&mut *self.tx;
-                "UPDATE request_keys SET answer = $3 WHERE actor = $1 AND name = $2";
-                author.user, &key.name, answer);
-        }
-        Ok(())
-    }
-
     /// Checks that a deployment has one of the versions that the change may replace.
     pub(super) async fn expect(&mut self, author: ChangeAuthor<'_>, id: &str) -> CloudResult<()> {
         let Some(versions) = author.versions else { return Ok(()) };
-        let newest =
-            super::waves::newest_releases(&mut self.tx, ReleaseChoice::Of(id)).await?.pop();
-        match newest.map(|release| release.version()) {
+        match self.newest(id).await?.map(|release| release.version()) {
             Some(version) if !versions.contains(&version) => {
                 let message = format!("deployment `{id}` has changed since: it is not as expected");
                 let help = "get it again, and send the change with its new `ETag`";
@@ -116,8 +94,8 @@ impl StoreChange<'_> {
 #[cfg(test)]
 impl super::CloudStore {
     pub(crate) async fn kept_answers(&self) -> Vec<String> {
-        let rows: Result<Vec<(String,)>, crate::sqlx::Error> =
-            async { Ok(rows!(&self.pool; "SELECT answer FROM request_keys")) }.await;
-        rows.unwrap().into_iter().map(|(answer,)| answer).collect()
+        let rows: CloudResult<_> =
+            async { Ok(rows!(self; "SELECT answer FROM request_keys")) }.await;
+        rows.unwrap()
     }
 }

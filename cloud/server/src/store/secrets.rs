@@ -4,45 +4,20 @@
 use super::{CloudStore, DAY_S, StoreChange, now};
 use crate::error::{CloudError, CloudResult};
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum SecretKind {
-    /// One-time code of a user.
-    Code,
-    /// Token of a user.
-    Token,
-    /// Session of a user of the page.
-    Session,
-    /// One-time token of a vehicle.
-    Enrolment,
-}
+/// A kind of secrets: its name, the start of its text, by which tools find secrets in files, and
+/// its lifetime in s.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct SecretKind(&'static str, &'static str, i64);
 
 impl SecretKind {
-    fn as_str(self) -> &'static str {
-        match self {
-            SecretKind::Code => "code",
-            SecretKind::Token => "token",
-            SecretKind::Session => "session",
-            SecretKind::Enrolment => "enrolment",
-        }
-    }
-
-    /// Returns the start of its text, by which tools find secrets in files.
-    fn prefix(self) -> &'static str {
-        match self {
-            SecretKind::Code => "glc_",
-            SecretKind::Token => "gln_",
-            SecretKind::Session => "gls_",
-            SecretKind::Enrolment => "gle_",
-        }
-    }
-
-    fn lifetime_s(self) -> i64 {
-        match self {
-            SecretKind::Code | SecretKind::Enrolment => DAY_S,
-            SecretKind::Session => DAY_S / 2,
-            SecretKind::Token => 90 * DAY_S,
-        }
-    }
+    /// One-time code of a user.
+    pub(super) const CODE: Self = Self("code", "glc_", DAY_S);
+    /// Token of a user.
+    pub(super) const TOKEN: Self = Self("token", "gln_", 90 * DAY_S);
+    /// Session of a user of the page.
+    pub(super) const SESSION: Self = Self("session", "gls_", DAY_S / 2);
+    /// One-time token of a vehicle.
+    pub(super) const ENROLMENT: Self = Self("enrolment", "gle_", DAY_S);
 }
 
 impl StoreChange<'_> {
@@ -52,7 +27,7 @@ impl StoreChange<'_> {
         kind: SecretKind,
         subject: &str,
     ) -> CloudResult<(String, i64)> {
-        self.add_named_secret(kind, subject, "", ("", kind.lifetime_s())).await
+        self.add_named_secret(kind, subject, "", ("", kind.2)).await
     }
 
     /// Makes a secret of `subject` with a name, a role and a lifetime in s.
@@ -67,13 +42,11 @@ impl StoreChange<'_> {
         getrandom::fill(&mut bytes).map_err(|error| {
             CloudError::busy("no secret can be made", "try again").because(error)
         })?;
-        let secret = format!("{}{}", kind.prefix(), gleaner_base::hex(&bytes));
+        let secret = format!("{}{}", kind.1, gleaner_base::hex(&bytes));
         let expires = now() + lifetime_s;
-        run!(&mut *self.tx; "DELETE FROM secrets WHERE expires <= $1"; now());
-        run!(&mut *self.tx;
-            "INSERT INTO secrets (hash, kind, subject, expires, name, role)
-             VALUES ($1, $2, $3, $4, $5, $6)";
-            hash(&secret), kind.as_str(), subject, expires, name, role);
+        run!(self; "DELETE FROM secrets WHERE expires <= $1"; now());
+        run!(self; "INSERT INTO secrets (hash, kind, subject, expires, name, role)
+             VALUES ($1, $2, $3, $4, $5, $6)"; hash(&secret), kind.0, subject, expires, name, role);
         Ok((secret, expires))
     }
 
@@ -83,47 +56,43 @@ impl StoreChange<'_> {
         kind: SecretKind,
         secret: &str,
     ) -> CloudResult<Option<String>> {
-        let subject: Option<(String,)> = row!(&mut *self.tx;
-            "DELETE FROM secrets WHERE hash = $1 AND kind = $2 AND expires > $3
-             RETURNING subject";
-            hash(secret), kind.as_str(), now());
-        Ok(subject.map(|(subject,)| subject))
-    }
-
-    pub(super) async fn drop_other_secrets(
-        &mut self,
-        kind: SecretKind,
-        subject: &str,
-        kept: &str,
-    ) -> CloudResult<()> {
-        run!(&mut *self.tx;
-            "DELETE FROM secrets WHERE kind = $1 AND subject = $2 AND hash <> $3";
-            kind.as_str(), subject, hash(kept));
-        Ok(())
+        Ok(row!(self; "DELETE FROM secrets WHERE hash = $1 AND kind = $2 AND expires > $3 RETURNING
+             subject"; hash(secret), kind.0, now()))
     }
 
     pub(super) async fn drop_secrets(
         &mut self,
         kind: SecretKind,
         subject: &str,
+        kept: &str,
     ) -> CloudResult<()> {
-        self.drop_other_secrets(kind, subject, "").await
+        run!(self; "DELETE FROM secrets WHERE kind = $1 AND subject = $2 AND hash <> $3";
+            kind.0, subject, hash(kept));
+        Ok(())
+    }
+}
+
+typed! {
+    /// A user with a secret, and the name and the role of the secret, which are empty for most.
+    pub(super) struct UserRow {
+        pub(super) person: String,
+        pub(super) role: String,
+        pub(super) secret: String,
+        pub(super) secret_role: String,
     }
 }
 
 impl CloudStore {
-    /// Returns the name and the role of the user with this secret, and the name and the role that
-    /// the secret itself has, which are empty for most.
     pub(super) async fn user_row(
         &self,
         kind: SecretKind,
         secret: &str,
-    ) -> CloudResult<Option<(String, String, String, String)>> {
-        Ok(row!(&self.pool;
-            "SELECT users.name, users.role, secrets.name, secrets.role FROM secrets
-             JOIN users ON users.name = secrets.subject
-             WHERE secrets.hash = $1 AND secrets.kind = $2 AND secrets.expires > $3";
-            hash(secret), kind.as_str(), now()))
+    ) -> CloudResult<Option<UserRow>> {
+        Ok(row!(self;
+            "SELECT users.name AS person, users.role, secrets.name AS secret,
+             secrets.role AS secret_role
+             FROM secrets JOIN users ON users.name = secrets.subject
+             WHERE hash = $1 AND kind = $2 AND expires > $3"; hash(secret), kind.0, now()))
     }
 }
 

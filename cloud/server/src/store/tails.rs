@@ -23,26 +23,23 @@ impl CloudStore {
     /// ended. Returns the number of leases of all processes.
     pub(crate) async fn extend_tails(&self, read: &[(String, String)]) -> CloudResult<i64> {
         let mut change = self.change().await?;
-        run!(&mut *change.tx; "DELETE FROM tails WHERE until <= $1"; now());
+        run!(change; "DELETE FROM tails WHERE until <= $1"; now());
         for (vehicle, stream) in read {
-            run!(&mut *change.tx;
-                "INSERT INTO tails (vehicle, stream, until)
-                 SELECT name, CAST($2 AS TEXT), CAST($3 AS BIGINT) FROM vehicles WHERE name = $1
-                 ON CONFLICT (vehicle, stream) DO UPDATE SET until = excluded.until";
-                vehicle, stream, now() + if stream == STATUS_STREAM { STATUS_S } else { TAIL_S.into() });
+            let lease_s = if stream == STATUS_STREAM { STATUS_S } else { TAIL_S.into() };
+            run!(change; "INSERT INTO tails (vehicle, stream, until) SELECT name, CAST($2 AS TEXT),
+                 CAST($3 AS BIGINT) FROM vehicles WHERE name = $1 ON CONFLICT (vehicle, stream)
+                 DO UPDATE SET until = excluded.until"; vehicle, stream, now() + lease_s);
         }
-        let (count,): (i64,) = one!(&mut *change.tx; "SELECT COUNT(*) FROM tails");
+        let count = one!(change; "SELECT COUNT(*) FROM tails");
         change.commit().await?;
         Ok(count)
     }
 
     /// Returns the leases of vehicles that are connected to this process.
     pub(crate) async fn own_tails(&self) -> CloudResult<BTreeMap<String, VehicleTail>> {
-        let rows: Vec<(String, String, i64)> = rows!(&self.pool;
-            "SELECT tails.vehicle, tails.stream, tails.until FROM tails
-             JOIN vehicles ON vehicles.name = tails.vehicle
-             WHERE vehicles.replica = $1 AND tails.until > $2";
-            self.replica(), now());
+        let rows: Vec<(String, String, i64)> = rows!(self; "SELECT tails.vehicle,
+             tails.stream, tails.until FROM tails JOIN vehicles ON vehicles.name = tails.vehicle
+             WHERE vehicles.replica = $1 AND tails.until > $2"; self.replica(), now());
         let mut tails: BTreeMap<String, VehicleTail> = BTreeMap::new();
         for (vehicle, stream, until) in rows {
             let tail = tails.entry(vehicle).or_default();

@@ -100,7 +100,6 @@ fn batch(life: u64, seqs: std::ops::Range<u64>) -> StreamBatch {
     StreamBatch { lines: seqs.map(line).collect(), cursor }
 }
 
-/// Returns the stored rows of events of a vehicle.
 async fn rows(store: &CloudStore, vehicle: &str) -> Vec<String> {
     let rows = store.rows_after(vehicle, ["events"; 2], (0, 0), 1000).await.unwrap();
     rows.into_iter().map(|(_, line)| line).collect()

@@ -6,10 +6,9 @@ use gleaner_fleet::people::{NewToken, Role, TOKEN_DAYS_MAX, TokenSummary, User, 
 
 use super::secrets::SecretKind;
 use super::users::user;
-use super::{ChangeAuthor, CloudStore, int, now, unsigned};
+use super::{ChangeAuthor, CloudStore, now, unsigned};
 use crate::error::{CloudError, CloudResult};
 
-/// Maximum number of named tokens of a user.
 pub(crate) const TOKENS_MAX: i64 = 50;
 
 /// A user with a token, and the rights of that token.
@@ -36,14 +35,12 @@ impl TokenUser {
 
 impl CloudStore {
     pub(crate) async fn user(&self, token: &str) -> CloudResult<Option<TokenUser>> {
-        let Some((name, role, token, most)) = self.user_row(SecretKind::Token, token).await? else {
-            return Ok(None);
-        };
-        let mut user = user((name, role))?;
-        if !token.is_empty() {
-            user.role = user.role.min(role_of(&most)?);
+        let Some(row) = self.user_row(SecretKind::TOKEN, token).await? else { return Ok(None) };
+        let mut user = user((row.person, row.role))?;
+        if !row.secret.is_empty() {
+            user.role = user.role.min(role_of(&row.secret_role)?);
         }
-        Ok(Some(TokenUser::new(user, token)))
+        Ok(Some(TokenUser::new(user, row.secret)))
     }
 
     pub(crate) async fn make_token(
@@ -70,11 +67,10 @@ impl CloudStore {
         }
         let mut change = self.change().await?;
         change.begin_request(author).await?;
-        run!(&mut *change.tx; "DELETE FROM secrets WHERE expires <= $1"; now());
-        let (count, same): (i64, i64) = one!(&mut *change.tx;
-            "SELECT COUNT(*), COUNT(CASE WHEN name = $2 THEN 1 END) FROM secrets
-             WHERE kind = 'token' AND subject = $1 AND name <> ''";
-            &user.name, &name);
+        run!(change; "DELETE FROM secrets WHERE expires <= $1"; now());
+        let (count, same): (i64, i64) = one!(change;
+            "SELECT COUNT(*), COUNT(CASE WHEN name = $2 THEN 1 END)
+             FROM secrets WHERE kind = 'token' AND subject = $1 AND name <> ''"; &user.name, &name);
         if same > 0 {
             let message = format!("you have a token `{name}` already");
             return Err(CloudError::usage(message, "choose another name, or remove that token"));
@@ -85,7 +81,7 @@ impl CloudStore {
         }
         let rights = (role.as_str(), i64::from(days) * 86_400);
         let (token, expires) =
-            change.add_named_secret(SecretKind::Token, &user.name, &name, rights).await?;
+            change.add_named_secret(SecretKind::TOKEN, &user.name, &name, rights).await?;
         let subject = format!("{}/{name}", user.name);
         change.note(&user.name, &format!("make token as {role}"), &subject).await?;
         change.commit().await?;
@@ -100,31 +96,25 @@ impl CloudStore {
         after: &str,
         most: u64,
     ) -> CloudResult<Vec<TokenSummary>> {
-        let rows: Vec<(String, String, String, i64)> = rows!(&self.pool;
-            "SELECT subject, name, role, expires FROM secrets
-             WHERE kind = 'token' AND name <> '' AND expires > $1 AND ($2 = '' OR subject = $2)
-             AND subject || '/' || name > $3 ORDER BY subject || '/' || name LIMIT $4";
-            now(), of.unwrap_or_default(), after, int(most));
-        let summary = |(user, name, role, expires): (String, String, String, i64)| {
-            Ok(TokenSummary { user, name, role: role_of(&role)?, expires: unsigned(expires) })
+        let rows: Vec<(String, String, String, u64)> = rows!(self;
+            "SELECT subject, name, role, expires FROM secrets WHERE kind = 'token' AND name <> ''
+             AND expires > $1 AND ($2 = '' OR subject = $2) AND subject || '/' || name > $3
+             ORDER BY subject || '/' || name LIMIT $4"; now(), of.unwrap_or_default(), after, most);
+        let summary = |(user, name, role, expires): (_, _, String, _)| {
+            Ok(TokenSummary { user, name, role: role_of(&role)?, expires })
         };
         rows.into_iter().map(summary).collect()
     }
 
-    /// Removes a named token of the user `of`.
     pub(crate) async fn remove_token(&self, actor: &str, of: &str, name: &str) -> CloudResult<()> {
         let mut change = self.change().await?;
-        let removed = run!(&mut *change.tx;
-            "DELETE FROM secrets WHERE kind = 'token' AND subject = $1 AND name = $2
-             AND name <> ''";
-            of, name);
+        let removed = run!(change; "DELETE FROM secrets
+             WHERE kind = 'token' AND subject = $1 AND name = $2 AND name <> ''"; of, name);
         let subject = format!("{of}/{name}");
         if removed.rows_affected() == 0 {
             let message = format!("there is no token `{}`", excerpt(&subject));
-            return Err(CloudError::missing(
-                message,
-                "list the tokens, and use one of their names",
-            ));
+            let help = "list the tokens, and use one of their names";
+            return Err(CloudError::missing(message, help));
         }
         change.note(actor, "remove token", &subject).await?;
         change.commit().await
@@ -132,7 +122,7 @@ impl CloudStore {
 
     pub(crate) async fn end_token(&self, actor: &str, token: &str) -> CloudResult<()> {
         let mut change = self.change().await?;
-        if let Some(user) = change.take_secret(SecretKind::Token, token).await? {
+        if let Some(user) = change.take_secret(SecretKind::TOKEN, token).await? {
             change.note(actor, "logout", &user).await?;
         }
         change.commit().await

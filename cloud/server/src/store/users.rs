@@ -4,13 +4,12 @@ use gleaner_base::excerpt;
 use gleaner_fleet::people::{Invitation, NewUser, Role, User, UserToken};
 
 use super::secrets::SecretKind;
-use super::{ChangeAuthor, CloudStore, int, now, unsigned};
+use super::{ChangeAuthor, CloudStore, now, unsigned};
 use crate::error::{CloudError, CloudResult};
 
 /// Actor of changes that the program itself makes, for a person at its machine.
 pub(crate) const CONSOLE: &str = "console";
 
-/// Name of the user that the first start invites.
 const ADMIN: &str = "admin";
 
 impl CloudStore {
@@ -34,12 +33,10 @@ impl CloudStore {
         }
         let mut change = self.change().await?;
         change.begin_request(author).await?;
-        run!(&mut *change.tx;
-            "INSERT INTO users (name, role) VALUES ($1, $2)
-             ON CONFLICT (name) DO UPDATE SET role = excluded.role";
-            &name, role.as_str());
-        change.drop_secrets(SecretKind::Code, &name).await?;
-        let (code, expires) = change.add_secret(SecretKind::Code, &name).await?;
+        run!(change; "INSERT INTO users (name, role) VALUES ($1, $2)
+             ON CONFLICT (name) DO UPDATE SET role = excluded.role"; &name, role.as_str());
+        change.drop_secrets(SecretKind::CODE, &name, "").await?;
+        let (code, expires) = change.add_secret(SecretKind::CODE, &name).await?;
         change.note(author.name, &format!("invite as {role}"), &name).await?;
         change.commit().await?;
         Ok(Invitation { user: User { name, role }, code, expires: unsigned(expires) })
@@ -47,27 +44,22 @@ impl CloudStore {
 
     /// Invites an administrator, unless one has a valid token or a password.
     pub(crate) async fn invite_first(&self) -> CloudResult<Option<Invitation>> {
-        let (able,): (i64,) = one!(&self.pool;
-            "SELECT COUNT(*) FROM users WHERE role = 'admin' AND (password <> '' OR EXISTS
-             (SELECT 1 FROM secrets WHERE secrets.subject = users.name
-              AND secrets.kind = 'token' AND secrets.name = '' AND secrets.expires > $1))";
-            now());
-        match able {
-            0 => {
-                let admin = NewUser { name: ADMIN.to_owned(), role: Role::Admin };
-                self.invite(CONSOLE, admin).await.map(Some)
-            }
-            _ => Ok(None),
+        let able: i64 = one!(self; "SELECT COUNT(*) FROM users WHERE role = 'admin'
+             AND (password <> '' OR EXISTS (SELECT 1 FROM secrets WHERE secrets.subject = users.name
+             AND secrets.kind = 'token' AND secrets.name = '' AND secrets.expires > $1))"; now());
+        if able > 0 {
+            return Ok(None);
         }
+        let admin = NewUser { name: ADMIN.to_owned(), role: Role::Admin };
+        self.invite(CONSOLE, admin).await.map(Some)
     }
 
     /// Exchanges a code for a token; `None` if the code is wrong, used or too old.
     pub(crate) async fn login(&self, code: &str) -> CloudResult<Option<UserToken>> {
         let mut change = self.change().await?;
-        let Some(name) = change.take_secret(SecretKind::Code, code).await? else { return Ok(None) };
-        let (role,): (String,) =
-            one!(&mut *change.tx; "SELECT role FROM users WHERE name = $1"; &name);
-        let (token, expires) = change.add_secret(SecretKind::Token, &name).await?;
+        let Some(name) = change.take_secret(SecretKind::CODE, code).await? else { return Ok(None) };
+        let role: String = one!(change; "SELECT role FROM users WHERE name = $1"; &name);
+        let (token, expires) = change.add_secret(SecretKind::TOKEN, &name).await?;
         change.note(&name, "login", &name).await?;
         change.commit().await?;
         Ok(Some(UserToken { user: user((name, role))?, token, expires: unsigned(expires) }))
@@ -77,8 +69,8 @@ impl CloudStore {
     /// if the code is wrong, used or too old.
     pub(crate) async fn open_session(&self, code: &str) -> CloudResult<Option<(String, String)>> {
         let mut change = self.change().await?;
-        let Some(name) = change.take_secret(SecretKind::Code, code).await? else { return Ok(None) };
-        let (session, _) = change.add_secret(SecretKind::Session, &name).await?;
+        let Some(name) = change.take_secret(SecretKind::CODE, code).await? else { return Ok(None) };
+        let (session, _) = change.add_secret(SecretKind::SESSION, &name).await?;
         change.note(&name, "login", &name).await?;
         change.commit().await?;
         Ok(Some((session, name)))
@@ -91,34 +83,32 @@ impl CloudStore {
         password: &str,
     ) -> CloudResult<Option<String>> {
         let mut change = self.change().await?;
-        let stored: Option<(String,)> =
-            row!(&mut *change.tx; "SELECT password FROM users WHERE name = $1"; name);
-        if stored.is_none_or(|(stored,)| stored != password) {
+        let stored: Option<String> =
+            row!(change; "SELECT password FROM users WHERE name = $1"; name);
+        if stored.is_none_or(|stored| stored != password) {
             return Ok(None);
         }
-        let (session, _) = change.add_secret(SecretKind::Session, name).await?;
+        let (session, _) = change.add_secret(SecretKind::SESSION, name).await?;
         change.note(name, "login by password", name).await?;
         change.commit().await?;
         Ok(Some(session))
     }
 
     pub(crate) async fn session(&self, session: &str) -> CloudResult<Option<User>> {
-        let row = self.user_row(SecretKind::Session, session).await?;
-        row.map(|(name, role, ..)| user((name, role))).transpose()
+        let row = self.user_row(SecretKind::SESSION, session).await?;
+        row.map(|row| user((row.person, row.role))).transpose()
     }
 
-    /// Ends a session, if it exists.
     pub(crate) async fn close_session(&self, session: &str) -> CloudResult<()> {
         let mut change = self.change().await?;
-        change.take_secret(SecretKind::Session, session).await?;
+        change.take_secret(SecretKind::SESSION, session).await?;
         change.commit().await
     }
 
-    /// Returns the hash of a user's password; `None` without one.
     pub(crate) async fn password(&self, name: &str) -> CloudResult<Option<String>> {
-        let row: Option<(String,)> =
-            row!(&self.pool; "SELECT password FROM users WHERE name = $1"; name);
-        Ok(row.map(|(password,)| password).filter(|it| !it.is_empty()))
+        let password: Option<String> =
+            row!(self; "SELECT password FROM users WHERE name = $1"; name);
+        Ok(password.filter(|it| !it.is_empty()))
     }
 
     /// Sets the hash of a user's password, and ends the user's other sessions than `session`.
@@ -129,31 +119,30 @@ impl CloudStore {
         session: &str,
     ) -> CloudResult<()> {
         let mut change = self.change().await?;
-        run!(&mut *change.tx; "UPDATE users SET password = $2 WHERE name = $1"; name, password);
-        change.drop_other_secrets(SecretKind::Session, name, session).await?;
+        run!(change; "UPDATE users SET password = $2 WHERE name = $1"; name, password);
+        change.drop_secrets(SecretKind::SESSION, name, session).await?;
         change.note(name, "set password", name).await?;
         change.commit().await
     }
 
     pub(crate) async fn users(&self, after: &str, most: u64) -> CloudResult<Vec<User>> {
-        let rows: Vec<_> = rows!(&self.pool;
-            "SELECT name, role FROM users WHERE name > $1 ORDER BY name LIMIT $2";
-            after, int(most));
+        let rows: Vec<_> = rows!(self;
+            "SELECT name, role FROM users WHERE name > $1 ORDER BY name LIMIT $2"; after, most);
         rows.into_iter().map(user).collect()
     }
 
     /// Removes a user, and the tokens and sessions of the user.
     pub(crate) async fn remove_user(&self, actor: &str, name: &str) -> CloudResult<()> {
         let mut change = self.change().await?;
-        let removed = run!(&mut *change.tx; "DELETE FROM users WHERE name = $1"; name);
+        let removed = run!(change; "DELETE FROM users WHERE name = $1"; name);
         if removed.rows_affected() == 0 {
             let message = format!("there is no user `{}`", excerpt(name));
             return Err(CloudError::missing(message, "list the users, and use one of their names"));
         }
-        for kind in [SecretKind::Code, SecretKind::Token, SecretKind::Session] {
-            change.drop_secrets(kind, name).await?;
+        for kind in [SecretKind::CODE, SecretKind::TOKEN, SecretKind::SESSION] {
+            change.drop_secrets(kind, name, "").await?;
         }
-        run!(&mut *change.tx; "DELETE FROM request_keys WHERE actor = $1"; name);
+        run!(change; "DELETE FROM request_keys WHERE actor = $1"; name);
         change.note(actor, "remove user", name).await?;
         change.commit().await
     }

@@ -3,17 +3,14 @@
 use std::collections::BTreeMap;
 
 use gleaner_base::excerpt;
-use gleaner_fleet::people::{VehicleState, VehicleSummary};
+use gleaner_fleet::people::VehicleSummary;
 use gleaner_trust::VehicleName;
 
 use super::secrets::SecretKind;
 use super::wants::next_wanted;
-use super::writer::DOUBLE;
-use super::{ChangeAuthor, CloudStore, StoreChange, in_list, int, now, now_ms, parts, unsigned};
+use super::{ChangeAuthor, CloudStore, StoreChange, int, now, now_ms};
 use crate::error::{CloudError, CloudResult};
-use crate::sqlx::{self, AssertSqlSafe};
 
-/// A certificate that was made for a vehicle.
 #[derive(Debug)]
 pub(crate) struct Issued {
     pub(crate) certificate: String,
@@ -32,19 +29,16 @@ impl CloudStore {
     ) -> CloudResult<String> {
         let author = author.into();
         if let Err(reason) = name.parse::<VehicleName>() {
-            return Err(
-                CloudError::usage("no vehicle can be enrolled", "use another name").because(reason)
-            );
+            let refused = CloudError::usage("no vehicle can be enrolled", "use another name");
+            return Err(refused.because(reason));
         }
         let mut change = self.change().await?;
         change.begin_request(author).await?;
         change.begin_streams_of_revoked(name).await?;
-        run!(&mut *change.tx;
-            "INSERT INTO vehicles (name) VALUES ($1)
-             ON CONFLICT (name) DO UPDATE SET is_revoked = 0";
-            name);
-        change.drop_secrets(SecretKind::Enrolment, name).await?;
-        let (token, _) = change.add_secret(SecretKind::Enrolment, name).await?;
+        run!(change; "INSERT INTO vehicles (name)
+             VALUES ($1) ON CONFLICT (name) DO UPDATE SET is_revoked = 0"; name);
+        change.drop_secrets(SecretKind::ENROLMENT, name, "").await?;
+        let (token, _) = change.add_secret(SecretKind::ENROLMENT, name).await?;
         change.note(author.name, "invite vehicle", name).await?;
         change.refresh_one(name).await?;
         change.commit().await?;
@@ -61,7 +55,7 @@ impl CloudStore {
         issue: impl FnOnce() -> CloudResult<Issued>,
     ) -> CloudResult<Option<Issued>> {
         let mut change = self.change().await?;
-        let subject = change.take_secret(SecretKind::Enrolment, token).await?;
+        let subject = change.take_secret(SecretKind::ENROLMENT, token).await?;
         // Dropped, the change keeps the token for the vehicle that it is for.
         if subject.as_deref() != Some(name) {
             return Ok(None);
@@ -69,7 +63,7 @@ impl CloudStore {
         let issued = issue()?;
         change.add_certificate(name, &issued).await?;
         // Only the machine that has used the token is known from now on.
-        run!(&mut *change.tx;
+        run!(change;
             "UPDATE vehicles SET is_double = 0, boot = '', former_boot = '' WHERE name = $1"; name);
         change.note(name, "enrol", name).await?;
         change.commit().await?;
@@ -85,11 +79,11 @@ impl CloudStore {
         issued: &Issued,
     ) -> CloudResult<()> {
         let mut change = self.change().await?;
-        change.drop_certificates(name, current).await?;
+        run!(change; "DELETE FROM certificates WHERE vehicle = $1 AND sha256 <> $2"; name, current);
         // The vehicle may have been cut off since the request came.
-        let is_valid: Option<(String,)> = row!(&mut *change.tx;
+        let valid: Option<String> = row!(change;
             "SELECT sha256 FROM certificates WHERE sha256 = $1"; current);
-        is_valid.ok_or_else(ended)?;
+        valid.ok_or_else(ended)?;
         change.add_certificate(name, issued).await?;
         change.note(name, "renew", name).await?;
         change.commit().await
@@ -99,15 +93,13 @@ impl CloudStore {
     pub(crate) async fn revoke(&self, actor: &str, name: &str) -> CloudResult<()> {
         let mut change = self.change().await?;
         // With a higher epoch, no connection to any replica counts, also once it is enrolled again.
-        let revoked = run!(&mut *change.tx;
-            "UPDATE vehicles SET is_revoked = 1, replica = '',
-             epoch = CASE WHEN epoch > 0 THEN epoch + 1 ELSE 0 END WHERE name = $1";
-            name);
+        let revoked = run!(change; "UPDATE vehicles SET is_revoked = 1, replica = '', epoch = CASE
+             WHEN epoch > 0 THEN epoch + 1 ELSE 0 END WHERE name = $1"; name);
         if revoked.rows_affected() == 0 {
             return Err(unknown(name));
         }
-        change.drop_secrets(SecretKind::Enrolment, name).await?;
-        change.drop_certificates(name, "").await?;
+        change.drop_secrets(SecretKind::ENROLMENT, name, "").await?;
+        run!(change; "DELETE FROM certificates WHERE vehicle = $1"; name);
         change.note(actor, "revoke vehicle", name).await?;
         change.commit().await
     }
@@ -120,9 +112,7 @@ impl CloudStore {
     ) -> CloudResult<()> {
         let author = author.into();
         let mut change = self.change().await?;
-        let found = run!(&mut *change.tx;
-            concat!("UPDATE vehicles SET ", next_wanted!(), ", is_ahead = 0 WHERE name = $1");
-            name);
+        let found = run!(change; next_wanted!(", is_ahead = 0 WHERE name = $1"); name);
         if found.rows_affected() == 0 {
             return Err(unknown(name));
         }
@@ -141,16 +131,14 @@ impl CloudStore {
         after: &str,
         most: u64,
     ) -> CloudResult<Vec<VehicleSummary>> {
-        let rows: Vec<VehicleRow> = rows!(&self.pool;
-            concat!(vehicle_columns!(), " WHERE name > $1 ORDER BY name LIMIT $2");
-            after, int(most));
-        Ok(rows.into_iter().map(summary).collect())
+        let sql = vehicle_summary!("WHERE name > $1 ORDER BY name LIMIT $2");
+        Ok(rows!(self; sql; after, most))
     }
 
     /// Returns the newest status of a vehicle, as JSON with its age.
     pub(crate) async fn status(&self, name: &str) -> CloudResult<String> {
         let status: Option<(String, i64)> =
-            row!(&self.pool; "SELECT status, reported_ms FROM vehicles WHERE name = $1"; name);
+            row!(self; "SELECT status, reported_ms FROM vehicles WHERE name = $1"; name);
         let (status, reported_ms) = status.ok_or_else(|| unknown(name))?;
         // What is stored was parsed as an object, without an age.
         let Some(fields) = status.trim_end().strip_suffix('}') else {
@@ -172,15 +160,8 @@ impl CloudStore {
         for (time, names) in names_of {
             // A transaction for each second, so that what vehicles send does not wait for all.
             let mut change = self.change().await?;
-            for part in parts(&names) {
-                let (names, last) = (in_list(part.len()), part.len() + 1);
-                let sql = format!(
-                    "UPDATE vehicles SET seen = ${last} WHERE seen < ${last} AND name IN ({names})"
-                );
-                let query = sqlx::query(AssertSqlSafe(sql));
-                let query = part.iter().fold(query, |query, name| query.bind(*name));
-                query.bind(time).execute(&mut *change.tx).await?;
-            }
+            let sql = "UPDATE vehicles SET seen = $1 WHERE seen < $1 AND name IN ($2..)";
+            change.run_in(sql, &names, &values! { time }).await?;
             change.commit().await?;
         }
         Ok(())
@@ -192,20 +173,20 @@ impl StoreChange<'_> {
     /// number that a thief may have sent stands for records of the one that is enrolled, and no
     /// mere announcement for its clips.
     async fn begin_streams_of_revoked(&mut self, name: &str) -> CloudResult<()> {
-        const IS_REVOKED: &str =
-            "EXISTS (SELECT 1 FROM vehicles WHERE vehicles.name = $1 AND is_revoked = 1)";
-        const ANNOUNCED: &str = "vehicle = $1 AND state <> 'stored' AND parts = 0";
-        for change in [
+        let revoked: Option<String> = row!(self;
+            "SELECT name FROM vehicles WHERE name = $1 AND is_revoked = 1"; name);
+        if revoked.is_none() {
+            return Ok(());
+        }
+        for sql in [
             "UPDATE streams SET life = life + 1, next = 0, seq = 0, boot = '', boot_ns = 0
              WHERE vehicle = $1",
             "UPDATE clip_vehicles SET position = '' WHERE vehicle = $1",
-            &format!(
-                "DELETE FROM clip_words WHERE clip IN (SELECT seq FROM clips WHERE {ANNOUNCED})"
-            ),
-            &format!("DELETE FROM clips WHERE {ANNOUNCED}"),
+            "DELETE FROM clip_words WHERE clip IN (SELECT seq FROM clips
+             WHERE vehicle = $1 AND state <> 'stored' AND parts = 0)",
+            "DELETE FROM clips WHERE vehicle = $1 AND state <> 'stored' AND parts = 0",
         ] {
-            let sql = format!("{change} AND {IS_REVOKED}");
-            sqlx::query(AssertSqlSafe(sql)).bind(name).execute(&mut *self.tx).await?;
+            run!(self; sql; name);
         }
         Ok(())
     }
@@ -213,71 +194,47 @@ impl StoreChange<'_> {
     /// Adds a certificate. In the database, each ends after the former ones, by which the newest
     /// is known.
     async fn add_certificate(&mut self, name: &str, issued: &Issued) -> CloudResult<()> {
-        let (last,): (i64,) = one!(&mut *self.tx;
+        let last: i64 = one!(self;
             "SELECT COALESCE(MAX(expires), 0) FROM certificates WHERE vehicle = $1"; name);
-        run!(&mut *self.tx;
-            "INSERT INTO certificates (sha256, vehicle, expires) VALUES ($1, $2, $3)";
+        run!(self; "INSERT INTO certificates (sha256, vehicle, expires) VALUES ($1, $2, $3)";
             &issued.sha256, name, int(issued.expires).max(last + 1));
         Ok(())
     }
-
-    async fn drop_certificates(&mut self, name: &str, kept: &str) -> CloudResult<()> {
-        run!(&mut *self.tx;
-            "DELETE FROM certificates WHERE vehicle = $1 AND sha256 <> $2";
-            name, kept);
-        Ok(())
-    }
 }
 
-/// The columns of a [`VehicleRow`].
-macro_rules! vehicle_columns {
+columns!(VehicleSummary: name, labels, state, seen, version, key, wanted, handled, is_ahead,
+    is_double, problems, running, deployments);
+
+/// The state of a vehicle: it is online if a process whose lease has not ended has its newest
+/// connection.
+macro_rules! vehicle_state {
     () => {
-        "SELECT name, is_revoked, epoch, seen, version, labels, generation, handled, problems,
-         running, deployments, is_ahead, is_double, clip_key,
-         CASE WHEN replica IN (SELECT id FROM replicas) THEN 1 ELSE 0 END FROM vehicles"
+        "CASE WHEN is_revoked <> 0 THEN 'revoked'
+         WHEN replica IN (SELECT id FROM replicas) THEN 'online'
+         WHEN epoch = 0 THEN 'invited' ELSE 'offline' END AS state"
     };
 }
-pub(super) use vehicle_columns;
+pub(super) use vehicle_state;
 
-/// The values from which the summary of a vehicle is made.
-pub(super) type VehicleRow =
-    (String, i64, i64, i64, String, String, i64, i64, String, i64, i64, i64, i64, String, i64);
-
-pub(super) fn summary(row: VehicleRow) -> VehicleSummary {
-    let (name, is_revoked, epoch, seen, version, labels, wanted, handled, problems, ..) = row;
-    VehicleSummary {
-        labels: serde_json::from_str(&labels).unwrap_or_default(),
-        state: vehicle_state(is_revoked, epoch, row.14),
-        seen: (seen > 0).then_some(unsigned(seen)),
-        version: (!version.is_empty()).then_some(version),
-        key: row.13,
-        wanted: unsigned(wanted),
-        handled: unsigned(handled),
-        is_ahead: row.11 != 0,
-        is_double: row.12 >= DOUBLE,
-        problems: serde_json::from_str(&problems).unwrap_or_default(),
-        running: unsigned(row.9),
-        deployments: unsigned(row.10),
-        name,
-    }
+/// A query of a [`VehicleSummary`]. `is_double` is [`DOUBLE`](super::writer::DOUBLE) at most.
+macro_rules! vehicle_summary {
+    ($rest:literal) => {
+        concat!(
+            "SELECT name, labels, NULLIF(seen, 0) AS seen, NULLIF(version, '') AS version,
+             clip_key AS key, generation AS wanted, handled, is_ahead, CASE
+             WHEN is_double >= 2 THEN 1 ELSE 0 END AS is_double, problems, running, deployments, ",
+            crate::store::vehicles::vehicle_state!(),
+            " FROM vehicles ",
+            $rest
+        )
+    };
 }
-
-/// Returns the state of a vehicle with these values. It is online if a process whose lease has not
-/// ended has its newest connection.
-pub(super) fn vehicle_state(is_revoked: i64, epoch: i64, is_online: i64) -> VehicleState {
-    match () {
-        () if is_revoked != 0 => VehicleState::Revoked,
-        () if is_online != 0 => VehicleState::Online,
-        () if epoch == 0 => VehicleState::Invited,
-        () => VehicleState::Offline,
-    }
-}
+pub(super) use vehicle_summary;
 
 /// State of a deployment that runs as it should.
 pub(super) const RUNNING: &str = "running";
 /// State of a deployment that was refused, or whose lambda or revision has failed.
 pub(super) const FAILED: &str = "failed";
-
 /// State of a deployment that the vehicle could not fetch yet.
 pub(super) const PENDING: &str = "pending";
 
@@ -287,7 +244,6 @@ pub(super) fn ended() -> CloudError {
     CloudError::denied(message, "connect again")
 }
 
-/// Returns the error of a vehicle that does not exist.
 pub(super) fn unknown(name: &str) -> CloudError {
     let message = format!("there is no vehicle `{}`", excerpt(name));
     CloudError::missing(message, "`gleaner vehicles` lists all")

@@ -9,15 +9,18 @@ use gleaner_fleet::{Wanted, desired_digest};
 use super::deployments::COMPLETE;
 use super::lookups::AHEAD;
 use super::vehicles::ended;
-use super::{CloudStore, StoreChange, in_list, parts, unsigned};
+use super::waves::Tx;
+use super::{CloudStore, StoreChange, unsigned};
 use crate::error::CloudResult;
-use crate::sqlx::{self, AssertSqlSafe};
 
 /// Counts a wanted state, which is sent at once to a vehicle that is connected.
 macro_rules! next_wanted {
-    () => {
-        "generation = generation + 1, offered = CASE
-         WHEN replica IN (SELECT id FROM replicas) THEN generation + 1 ELSE offered END"
+    ($rest:literal) => {
+        concat!(
+            "UPDATE vehicles SET generation = generation + 1, offered = CASE
+             WHEN replica IN (SELECT id FROM replicas) THEN generation + 1 ELSE offered END",
+            $rest
+        )
     };
 }
 pub(super) use next_wanted;
@@ -35,15 +38,15 @@ pub(crate) struct VehicleWants {
     pub(crate) keeps: bool,
 }
 
-/// The vehicles whose wanted state has changed.
 pub(crate) type ChangedVehicles = Vec<String>;
 
-/// A vehicle whose wanted state may have changed.
-pub(super) struct WishedVehicle {
-    pub(super) name: String,
-    pub(super) labels: String,
-    /// The digest of its wanted state so far.
-    pub(super) digest: String,
+typed! {
+    pub(super) struct WishedVehicle {
+        pub(super) name: String,
+        pub(super) labels: String,
+        /// The digest of its wanted state so far.
+        pub(super) digest: String,
+    }
 }
 
 /// Wanted states by their digests. It cannot be out of date, also if others change the database:
@@ -66,19 +69,22 @@ impl WantedStates {
     }
 }
 
-/// All releases, and the vehicles that waves have reached.
 struct FleetWishes {
     /// The releases by deployment, of each the newest first.
     releases: Vec<WishedRelease>,
     members: HashMap<String, HashSet<(String, i64)>>,
 }
 
-struct WishedRelease {
-    selector: TextMap,
-    number: i64,
-    is_complete: bool,
-    wanted: Wanted,
+typed! {
+    struct WishedRelease {
+        selector: TextMap,
+        number: i64,
+        is_complete: bool,
+        wanted: Wanted,
+    }
 }
+
+columns!(Wanted: id, envelope, is_wanted, rollback, start);
 
 impl CloudStore {
     pub(crate) async fn wants(&self, name: &str) -> CloudResult<VehicleWants> {
@@ -90,15 +96,13 @@ impl CloudStore {
         }
         // One transaction: the number and the deployments are of the same moment.
         let mut tx = self.pool.begin().await?;
-        let row: Option<(i64, String, i64)> = row!(&mut *tx;
-            "SELECT generation, labels, is_ahead FROM vehicles WHERE name = $1 AND is_revoked = 0";
-            name);
-        let (generation, labels, is_ahead) = row.ok_or_else(ended)?;
+        let row: Option<(u64, TextMap, bool)> = row!(&mut *tx; "SELECT generation, labels, is_ahead
+             FROM vehicles WHERE name = $1 AND is_revoked = 0"; name);
+        let (generation, labels, keeps) = row.ok_or_else(ended)?;
         let mut wishes = FleetWishes::load(&mut tx).await?;
         wishes.add_members(&mut tx, &[name]).await?;
-        let deployments: Arc<[Wanted]> = wishes.of(name, &map(&labels)).into();
+        let deployments: Arc<[Wanted]> = wishes.of(name, &labels).into();
         self.wanted.add(desired_digest(&deployments), Arc::clone(&deployments));
-        let (generation, keeps) = (unsigned(generation), is_ahead != 0);
         Ok(VehicleWants { generation, deployments, keeps })
     }
 }
@@ -106,19 +110,15 @@ impl CloudStore {
 impl StoreChange<'_> {
     /// Counts a new wanted state of each vehicle where it has changed; returns these vehicles.
     pub(super) async fn refresh_all(&mut self) -> CloudResult<ChangedVehicles> {
-        let vehicles: Vec<(String, String, String)> = rows!(&mut *self.tx;
+        let vehicles = rows!(self;
             "SELECT name, labels, digest FROM vehicles WHERE is_revoked = 0");
-        let vehicles = vehicles.into_iter();
-        let vehicles =
-            vehicles.map(|(name, labels, digest)| WishedVehicle { name, labels, digest });
-        self.refresh(vehicles.collect()).await
+        self.refresh(vehicles).await
     }
 
     /// Counts a new wanted state of the vehicle, if it has changed.
     pub(super) async fn refresh_one(&mut self, name: &str) -> CloudResult<()> {
-        let (labels, digest): (String, String) = one!(&mut *self.tx;
-            "SELECT labels, digest FROM vehicles WHERE name = $1"; name);
-        self.refresh(vec![WishedVehicle { name: name.to_owned(), labels, digest }]).await.map(drop)
+        let vehicle = one!(self; "SELECT name, labels, digest FROM vehicles WHERE name = $1"; name);
+        self.refresh(vec![vehicle]).await.map(drop)
     }
 
     /// Counts a new wanted state of each of these vehicles where it has changed; returns those.
@@ -149,60 +149,34 @@ impl StoreChange<'_> {
             }
         }
         for (digest, names) in &changed {
-            for part in parts(names) {
-                let (list, last) = (in_list(part.len()), part.len() + 1);
-                let sql = format!(
-                    "UPDATE vehicles SET {}, digest = ${last} WHERE name IN ({list})",
-                    next_wanted!()
-                );
-                let query = sqlx::query(AssertSqlSafe(sql));
-                let query = part.iter().fold(query, |query, name| query.bind(name));
-                query.bind(digest).execute(&mut *self.tx).await?;
-            }
+            let sql = next_wanted!(", digest = $1 WHERE name IN ($2..)");
+            self.run_in(sql, names, &values! { digest }).await?;
         }
         Ok(changed.into_values().flatten().collect())
     }
 }
 
 impl FleetWishes {
-    async fn load(tx: &mut sqlx::Transaction<'static, sqlx::Any>) -> CloudResult<Self> {
-        type Row = (String, i64, String, String, i64, i64, i64, String);
-        let rows: Vec<Row> = rows!(&mut **tx;
-            "SELECT id, number, sha256, selector, is_wanted, rollback_request, start_request, state
-             FROM releases JOIN deployments ON deployments.id = releases.deployment
-             ORDER BY id, number DESC");
-        let release = |(id, number, envelope, selector, is_wanted, rollback, start, state): Row| {
-            let (is_wanted, rollback, start) =
-                (is_wanted != 0, unsigned(rollback), unsigned(start));
-            let wanted = Wanted { id, envelope, is_wanted, rollback, start };
-            WishedRelease {
-                selector: map(&selector),
-                number,
-                is_complete: state == COMPLETE,
-                wanted,
-            }
-        };
-        Ok(Self { releases: rows.into_iter().map(release).collect(), members: HashMap::new() })
+    async fn load(tx: &mut Tx) -> CloudResult<Self> {
+        let releases = rows!(&mut **tx; "SELECT id, number, sha256 AS envelope,
+             selector, is_wanted, rollback_request AS rollback, start_request AS start,
+             CASE WHEN state = $1 THEN 1 ELSE 0 END AS is_complete FROM releases JOIN deployments
+             ON deployments.id = releases.deployment ORDER BY id, number DESC"; COMPLETE);
+        Ok(Self { releases, members: HashMap::new() })
     }
 
-    /// Adds those of these vehicles that waves have reached.
-    async fn add_members(
-        &mut self,
-        tx: &mut sqlx::Transaction<'static, sqlx::Any>,
-        names: &[&str],
-    ) -> CloudResult<()> {
+    async fn add_members(&mut self, tx: &mut Tx, names: &[&str]) -> CloudResult<()> {
         if self.releases.iter().all(|release| release.is_complete) {
             return Ok(());
         }
         let rows: Vec<(String, String, i64)> = rows_in!(&mut **tx;
-            "SELECT vehicle, deployment, number FROM wave_members WHERE vehicle IN ()"; names);
+            "SELECT vehicle, deployment, number FROM wave_members WHERE vehicle IN ($1..)"; names);
         for (vehicle, deployment, number) in rows {
             self.members.entry(vehicle).or_default().insert((deployment, number));
         }
         Ok(())
     }
 
-    /// Returns the deployments that a vehicle should have.
     fn of(&self, name: &str, labels: &TextMap) -> Vec<Wanted> {
         let members = self.members.get(name);
         let mut wanted: Vec<Wanted> = Vec::new();

@@ -3,15 +3,15 @@
 //! Each step is one transaction with the counts that it follows from, so that it is taken once.
 
 use gleaner_fleet::waves::{OnFailure, WavePlan, WaveProgress, WaveState};
+use gleaner_protocol::vehicle_api::GrantStatus;
 use sha2::{Digest, Sha256};
 
 use super::deployments::{COMPLETE, unknown};
 use super::vehicles::{FAILED, RUNNING};
-use super::wants::{ChangedVehicles, TextMap, map, selects};
+use super::wants::{ChangedVehicles, TextMap, selects};
 use super::{ChangeAuthor, CloudStore, StoreChange, int, now, unsigned};
 use crate::error::{CloudError, CloudResult};
-use crate::sqlx::any::AnyRow;
-use crate::sqlx::{self, FromRow, Row};
+use crate::sqlx;
 
 /// Actor of steps that the cloud takes by a plan.
 const WAVES: &str = "waves";
@@ -20,24 +20,26 @@ const WAVES: &str = "waves";
 /// several intervals at which signs of life are stored.
 const AWAY_S: i64 = 120;
 
-type Tx = sqlx::Transaction<'static, sqlx::Any>;
+pub(super) type Tx = sqlx::Transaction<'static, sqlx::Any>;
 
-#[derive(Debug)]
-pub(super) struct Release {
-    pub(super) deployment: String,
-    pub(super) number: i64,
-    pub(super) sha256: String,
-    pub(super) revision: String,
-    pub(super) fallback: String,
-    pub(super) grants: String,
-    pub(super) selector: String,
-    rollback_request: i64,
-    pub(super) state: String,
-    plan: String,
-    wave: i64,
-    since: i64,
-    reason: String,
-    pub(super) is_wanted: i64,
+typed! {
+    #[derive(Debug)]
+    pub(super) struct Release {
+        pub(super) deployment: String,
+        pub(super) number: i64,
+        pub(super) sha256: String,
+        pub(super) revision: String,
+        pub(super) fallback: String,
+        pub(super) grants: GrantStatus,
+        pub(super) selector: TextMap,
+        rollback_request: i64,
+        pub(super) state: String,
+        plan: String,
+        wave: i64,
+        since: i64,
+        reason: String,
+        pub(super) is_wanted: bool,
+    }
 }
 
 /// Numbers of vehicles of a release, or of its waves.
@@ -54,59 +56,41 @@ pub(super) struct VehicleCount {
     away: u64,
 }
 
+typed! {
+    /// Vehicles with the same labels and standing.
+    struct VehicleGroup {
+        labels: TextMap,
+        standing: String,
+        on_fallback: bool,
+        is_forgiven: bool,
+        vehicles: u64,
+    }
+}
+
 #[derive(Debug, PartialEq)]
 enum WaveStep {
     Wait,
     /// Opens this wave, to vehicles that came since, too.
     Open(i64),
-    /// Opens the release to all.
     Complete,
     Pause(String),
     Rollback(String),
 }
 
-impl FromRow<'_, AnyRow> for Release {
-    fn from_row(row: &AnyRow) -> sqlx::Result<Self> {
-        Ok(Self {
-            deployment: row.try_get("deployment")?,
-            number: row.try_get("number")?,
-            sha256: row.try_get("sha256")?,
-            revision: row.try_get("revision")?,
-            fallback: row.try_get("fallback")?,
-            grants: row.try_get("grants")?,
-            selector: row.try_get("selector")?,
-            rollback_request: row.try_get("rollback_request")?,
-            state: row.try_get("state")?,
-            plan: row.try_get("plan")?,
-            wave: row.try_get("wave")?,
-            since: row.try_get("since")?,
-            reason: row.try_get("reason")?,
-            is_wanted: row.try_get("is_wanted")?,
-        })
-    }
-}
-
-/// Choice of deployments.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum ReleaseChoice<'c> {
-    /// The one with this id.
     Of(&'c str),
     /// Those after this id, at most so many.
     Part(&'c str, u64),
 }
 
-impl ReleaseChoice<'_> {
-    const ALL: Self = Self::Part("", u64::MAX);
-}
-
-/// Returns the newest release of each chosen deployment.
 pub(super) async fn newest_releases(
     tx: &mut Tx,
     choice: ReleaseChoice<'_>,
 ) -> CloudResult<Vec<Release>> {
     let (is_one, id, most) = match choice {
-        ReleaseChoice::Of(id) => (1, id, 1),
-        ReleaseChoice::Part(after, most) => (0, after, int(most)),
+        ReleaseChoice::Of(id) => (true, id, 1),
+        ReleaseChoice::Part(after, most) => (false, after, most),
     };
     Ok(rows!(&mut **tx;
         "SELECT deployment, number, sha256, revision, fallback, grants, selector,
@@ -115,22 +99,20 @@ pub(super) async fn newest_releases(
          WHERE number = (SELECT MAX(number) FROM releases AS other
                          WHERE other.deployment = releases.deployment)
          AND CASE WHEN $1 = 1 THEN deployment = $2 ELSE deployment > $2 END
-         ORDER BY deployment LIMIT $3";
-        is_one, id, most))
+         ORDER BY deployment LIMIT $3"; is_one, id, most))
 }
 
 impl CloudStore {
     /// Takes the steps that are due; returns the vehicles whose wanted state has changed.
     pub(crate) async fn advance_waves(&self) -> CloudResult<ChangedVehicles> {
-        let (running,): (i64,) =
-            one!(&self.pool; "SELECT COUNT(*) FROM releases WHERE state = 'running'");
+        let running: u64 = one!(self; "SELECT COUNT(*) FROM releases WHERE state = 'running'");
         if running == 0 {
             return Ok(Vec::new());
         }
         let mut change = self.change().await?;
         let mut has_changed = false;
-        for release in newest_releases(&mut change.tx, ReleaseChoice::ALL).await? {
-            if release.state != "running" || release.is_wanted == 0 {
+        for release in newest_releases(&mut change.tx, ReleaseChoice::Part("", u64::MAX)).await? {
+            if release.state != "running" || !release.is_wanted {
                 continue;
             }
             let count = release.count(&mut change.tx, true).await?;
@@ -174,14 +156,15 @@ impl CloudStore {
             WaveState::Aborted => ("aborted", format!("by {actor}"), "abort waves"),
         };
         if name != newest.state {
-            run!(&mut *change.tx;
-                "UPDATE releases SET state = $3, since = $4, reason = $5
-                 WHERE deployment = $1 AND number = $2";
-                id, newest.number, name, now(), reason);
+            run!(change; "UPDATE releases SET state = $3, since = $4, reason = $5
+                 WHERE deployment = $1 AND number = $2"; id, newest.number, name, now(), reason);
         }
         // Who resumes waves has seen the failures so far; those of other vehicles count.
         if state == WaveState::Running {
-            change.forgive(id, newest.number, &newest.sha256).await?;
+            run!(change; "UPDATE wave_members SET is_forgiven = 1
+                 WHERE deployment = $1 AND number = $2 AND vehicle IN (SELECT vehicle FROM reported
+                 WHERE deployment = $1 AND envelope = $3 AND state = $4)";
+                id, newest.number, &newest.sha256, FAILED);
         }
         change.finish(1, actor, action, id).await
     }
@@ -192,26 +175,12 @@ impl StoreChange<'_> {
         Ok(newest_releases(&mut self.tx, ReleaseChoice::Of(id)).await?.pop())
     }
 
-    /// Marks the vehicles of a release's waves that have failed so far.
-    async fn forgive(&mut self, id: &str, number: i64, envelope: &str) -> CloudResult<()> {
-        run!(&mut *self.tx;
-            "UPDATE wave_members SET is_forgiven = 1 WHERE deployment = $1 AND number = $2
-             AND EXISTS (SELECT 1 FROM reported
-                  WHERE reported.vehicle = wave_members.vehicle AND reported.deployment = $1
-                  AND reported.envelope = $3 AND reported.state = $4)";
-            id, number, envelope, FAILED);
-        Ok(())
-    }
-
-    /// Begins the time of the open wave again.
     pub(super) async fn restart_wave(&mut self, id: &str) -> CloudResult<()> {
-        run!(&mut *self.tx;
-            "UPDATE releases SET since = $2 WHERE deployment = $1 AND state = 'running'";
+        run!(self; "UPDATE releases SET since = $2 WHERE deployment = $1 AND state = 'running'";
             id, now());
         Ok(())
     }
 
-    /// Takes a step; returns whether anything has changed.
     async fn take_step(&mut self, release: &Release, step: WaveStep) -> CloudResult<bool> {
         let Release { deployment, number, .. } = release;
         let action = match step {
@@ -229,8 +198,7 @@ impl StoreChange<'_> {
                 format!("open release {number} to all")
             }
             WaveStep::Pause(reason) => {
-                run!(&mut *self.tx;
-                    "UPDATE releases SET state = 'paused', since = $3, reason = $4
+                run!(self; "UPDATE releases SET state = 'paused', since = $3, reason = $4
                      WHERE deployment = $1 AND number = $2 AND state = 'running'";
                     deployment, number, now(), &reason);
                 format!("pause release {number}: wave {} {reason}", release.wave)
@@ -253,43 +221,35 @@ impl StoreChange<'_> {
         wave: i64,
     ) -> CloudResult<usize> {
         let release = self.newest(id).await?.ok_or_else(|| unknown(id))?;
-        let (selector, share) = (map(&release.selector), release.share(wave)?);
-        let vehicles: Vec<(String, String, i64)> = rows!(&mut *self.tx;
-            "SELECT name, labels, (SELECT COUNT(*) FROM wave_members
-             WHERE vehicle = name AND deployment = $1 AND number = $2)
-             FROM vehicles WHERE is_revoked = 0 AND epoch > 0";
-            id, number);
-        let chosen = vehicles.iter().filter(|(_, labels, _)| selects(&selector, &map(labels)));
-        let (members, others): (Vec<_>, Vec<_>) =
-            chosen.partition(|(.., is_member)| *is_member > 0);
+        let (selector, share) = (&release.selector, release.share(wave)?);
+        let vehicles: Vec<(String, TextMap, bool)> = rows!(self; "SELECT name, labels,
+             (SELECT COUNT(*) FROM wave_members WHERE vehicle = name AND deployment = $1
+             AND number = $2) FROM vehicles WHERE is_revoked = 0 AND epoch > 0"; id, number);
+        let chosen = vehicles.iter().filter(|(_, labels, _)| selects(selector, labels));
+        let (members, others): (Vec<_>, Vec<_>) = chosen.partition(|(.., is_member)| *is_member);
         let target = ((members.len() + others.len()) * share).div_ceil(100);
         // By a hash: another choice for each release, and the same one for each process.
-        let mut others: Vec<_> =
-            others.iter().map(|(name, ..)| (order(id, number, name), name)).collect();
+        let order = |name: &str| <[u8; 32]>::from(Sha256::digest(format!("{id} {number} {name}")));
+        let mut others: Vec<_> = others.iter().map(|(name, ..)| (order(name), name)).collect();
         others.sort_unstable();
         others.truncate(target.saturating_sub(members.len()));
         for (_, name) in &others {
-            run!(&mut *self.tx;
-                "INSERT INTO wave_members (vehicle, deployment, number) VALUES ($1, $2, $3)";
-                name, id, number);
+            run!(self; "INSERT INTO wave_members (vehicle, deployment, number) VALUES ($1, $2, $3)";
+                *name, id, number);
         }
         // A wave that waits for its first vehicle began when it was opened.
-        run!(&mut *self.tx;
+        run!(self;
             "UPDATE releases SET since = CASE WHEN wave = $3 THEN since ELSE $4 END, wave = $3
-             WHERE deployment = $1 AND number = $2 AND state = 'running'";
-            id, number, wave, now());
+             WHERE deployment = $1 AND number = $2 AND state = 'running'"; id, number, wave, now());
         Ok(others.len())
     }
 
     /// Opens a release to all its vehicles, and drops older ones.
     pub(super) async fn complete(&mut self, id: &str, number: i64) -> CloudResult<()> {
-        run!(&mut *self.tx;
-            "UPDATE releases SET state = 'complete', plan = '', reason = ''
-             WHERE deployment = $1 AND number = $2";
-            id, number);
-        run!(&mut *self.tx;
-            "DELETE FROM releases WHERE deployment = $1 AND number < $2"; id, number);
-        run!(&mut *self.tx; "DELETE FROM wave_members WHERE deployment = $1"; id);
+        run!(self; "UPDATE releases SET state = 'complete', plan = '', reason = ''
+             WHERE deployment = $1 AND number = $2"; id, number);
+        run!(self; "DELETE FROM releases WHERE deployment = $1 AND number < $2"; id, number);
+        run!(self; "DELETE FROM wave_members WHERE deployment = $1"; id);
         Ok(())
     }
 }
@@ -299,6 +259,7 @@ impl Release {
     /// not with what vehicles report.
     pub(super) fn version(&self) -> String {
         let Self { number, sha256, is_wanted, rollback_request, state, wave, .. } = self;
+        let is_wanted = i64::from(*is_wanted);
         let wanted = serde_json::json!([number, sha256, is_wanted, rollback_request, state, wave]);
         gleaner_trust::sha256(wanted.to_string().as_bytes()).to_string().split_off(48)
     }
@@ -327,35 +288,33 @@ impl Release {
     pub(super) async fn count(&self, tx: &mut Tx, only_members: bool) -> CloudResult<VehicleCount> {
         let soak_end = if only_members { self.soak_end()? } else { 0 };
         // Grouped by labels, of which there are few: SQL cannot compare them with the selector.
-        let groups: Vec<(String, String, i64, i64, i64)> = rows!(&mut **tx;
+        let groups: Vec<VehicleGroup> = rows!(&mut **tx;
             "SELECT labels,
              CASE WHEN reported.state = $6 THEN reported.state
                   WHEN seen < $3 AND replica NOT IN (SELECT id FROM replicas)
                   THEN CASE WHEN seen < $7 THEN 'away' ELSE 'late' END
                   ELSE COALESCE(reported.state, 'late') END AS standing,
-             COALESCE(on_fallback, 0), COALESCE(is_forgiven, 0), COUNT(*)
-             FROM vehicles LEFT JOIN reported
-             ON reported.vehicle = vehicles.name AND reported.deployment = $1
-             AND reported.envelope = $5
+             COALESCE(on_fallback, 0) AS on_fallback, COALESCE(is_forgiven, 0) AS is_forgiven,
+             COUNT(*) AS vehicles FROM vehicles
+             LEFT JOIN reported ON reported.vehicle = vehicles.name
+             AND reported.deployment = $1 AND reported.envelope = $5
              LEFT JOIN wave_members ON wave_members.vehicle = vehicles.name
              AND wave_members.deployment = $1 AND wave_members.number = $2
              WHERE is_revoked = 0 AND epoch > 0 AND ($4 = 0 OR wave_members.vehicle IS NOT NULL)
              GROUP BY 1, 2, 3, 4";
-            &self.deployment, self.number, soak_end, i64::from(only_members), &self.sha256, FAILED,
+            &self.deployment, self.number, soak_end, only_members, &self.sha256, FAILED,
             now() - AWAY_S);
-        let (selector, mut count) = (map(&self.selector), VehicleCount::default());
-        for (labels, standing, on_fallback, is_forgiven, vehicles) in groups {
-            let labels: TextMap = map(&labels);
-            if !selects(&selector, &labels) {
+        let mut count = VehicleCount::default();
+        for VehicleGroup { labels, standing, on_fallback, is_forgiven, vehicles } in groups {
+            if !selects(&self.selector, &labels) {
                 continue;
             }
-            let vehicles = unsigned(vehicles);
             count.vehicles += vehicles;
             match &*standing {
                 FAILED => {
                     count.failed += vehicles;
-                    count.on_fallback += if on_fallback == 0 { 0 } else { vehicles };
-                    count.forgiven += if is_forgiven == 0 { 0 } else { vehicles };
+                    count.on_fallback += if on_fallback { vehicles } else { 0 };
+                    count.forgiven += if is_forgiven { vehicles } else { 0 };
                 }
                 RUNNING => count.running += vehicles,
                 "away" => count.away += vehicles,
@@ -369,8 +328,8 @@ impl Release {
     /// for an end of a sentence; empty without one.
     async fn failure(&self, tx: &mut Tx) -> CloudResult<String> {
         let row: Option<(String, String)> = row!(&mut **tx;
-            "SELECT name, COALESCE(reason, 'not connected since the soak time')
-             FROM wave_members JOIN vehicles ON name = wave_members.vehicle
+            "SELECT name, COALESCE(reason, 'not connected since the soak time') FROM wave_members
+             JOIN vehicles ON name = wave_members.vehicle
              LEFT JOIN reported ON reported.vehicle = name AND reported.deployment = $1
              AND envelope = $4 AND reported.state = $5
              WHERE wave_members.deployment = $1 AND wave_members.number = $2 AND is_revoked = 0
@@ -441,11 +400,6 @@ impl Release {
             () => WaveStep::Wait,
         })
     }
-}
-
-/// Returns the place of a vehicle in the order of a release's waves.
-fn order(id: &str, number: i64, vehicle: &str) -> [u8; 32] {
-    Sha256::digest(format!("{id} {number} {vehicle}")).into()
 }
 
 #[cfg(test)]

@@ -22,14 +22,11 @@ const GROUP_MAX: usize = 256;
 pub(super) trait VehicleWrite: Sized {
     type Done;
 
-    /// Makes the write one of a group.
     const WAITING: fn(Waiting<Self>) -> WaitingWrite;
-
-    fn vehicle(&self) -> &str;
 }
 
-/// A write that waits for its transaction.
 pub(super) struct Waiting<W: VehicleWrite> {
+    pub(super) vehicle: String,
     pub(super) write: W,
     /// The result, which is sent once it is durable. Without one, the write has failed with all of
     /// its transaction.
@@ -37,7 +34,6 @@ pub(super) struct Waiting<W: VehicleWrite> {
     reply: oneshot::Sender<CloudResult<W::Done>>,
 }
 
-/// A write of any kind.
 pub(super) enum WaitingWrite {
     Connect(Waiting<ConnectWrite>),
     Report(Waiting<ReportWrite>),
@@ -48,46 +44,46 @@ pub(super) enum WaitingWrite {
 /// The vehicles of a group as they are stored, apart from what the group has changed already.
 pub(super) type GroupVehicles = HashMap<String, GroupVehicle>;
 
-/// Values of a vehicle that its writes are checked against.
-#[derive(Debug, Clone)]
-pub(super) struct GroupVehicle {
-    pub(super) epoch: i64,
-    pub(super) is_revoked: bool,
-    pub(super) arrived: i64,
-    pub(super) labels: String,
-    pub(super) digest: String,
-    pub(super) generation: i64,
-    /// The newest wanted state that was sent to it.
-    pub(super) offered: i64,
-    pub(super) is_ahead: i64,
-    /// The boot of its machine, and the one before.
-    pub(super) boots: [String; 2],
-    /// Number of times that a former boot has come back, up to [`DOUBLE`].
-    pub(super) is_double: i64,
+typed! {
+    /// Values of a vehicle that its writes are checked against.
+    #[derive(Debug, Clone)]
+    pub(super) struct GroupVehicle {
+        name: String,
+        pub(super) epoch: i64,
+        pub(super) is_revoked: bool,
+        pub(super) arrived: i64,
+        pub(super) labels: String,
+        pub(super) digest: String,
+        pub(super) generation: i64,
+        /// The newest wanted state that was sent to it.
+        pub(super) offered: i64,
+        pub(super) is_ahead: i64,
+        /// The boot of its machine, and the one before.
+        pub(super) boot: String,
+        pub(super) former_boot: String,
+        /// Number of times that a former boot has come back, up to [`DOUBLE`].
+        pub(super) is_double: i64,
+    }
 }
 
 /// Number of times after which two machines have one identity: once, a failover may be the reason.
 pub(super) const DOUBLE: i64 = 2;
-
-/// The columns from which a [`GroupVehicle`] is made.
-type VehicleNumbers = (String, String, String, String, String, i64, i64, i64, i64, i64, i64, i64);
 
 impl GroupVehicle {
     /// Notes the boot of a machine that connects; returns whether it is let in. The former boot
     /// comes back again and again only if two machines have the identity: then the other one goes
     /// on alone.
     pub(super) fn admits(&mut self, boot: &str) -> bool {
-        let [newest, former] = &mut self.boots;
-        if boot.is_empty() || boot == newest {
+        if boot.is_empty() || boot == self.boot {
             return true;
         }
-        if boot == former {
+        if boot == self.former_boot {
             self.is_double = (self.is_double + 1).min(DOUBLE);
             if self.is_double == DOUBLE {
                 return false;
             }
         }
-        *former = std::mem::replace(newest, boot.to_owned());
+        self.former_boot = std::mem::replace(&mut self.boot, boot.to_owned());
         true
     }
 }
@@ -95,10 +91,10 @@ impl GroupVehicle {
 impl WaitingWrite {
     fn vehicle(&self) -> &str {
         match self {
-            Self::Connect(waiting) => waiting.write.vehicle(),
-            Self::Report(waiting) => waiting.write.vehicle(),
-            Self::Append(waiting) => waiting.write.vehicle(),
-            Self::Disconnect(waiting) => waiting.write.vehicle(),
+            Self::Connect(waiting) => &waiting.vehicle,
+            Self::Report(waiting) => &waiting.vehicle,
+            Self::Append(waiting) => &waiting.vehicle,
+            Self::Disconnect(waiting) => &waiting.vehicle,
         }
     }
 
@@ -121,7 +117,6 @@ impl<W: VehicleWrite> Waiting<W> {
     }
 }
 
-/// The queue of the task that writes.
 pub(super) struct WriteQueue(mpsc::Sender<WaitingWrite>);
 
 impl WriteQueue {
@@ -135,9 +130,14 @@ impl WriteQueue {
 
 impl CloudStore {
     /// Writes with others; returns once the write is durable.
-    pub(super) async fn write<W: VehicleWrite>(&self, write: W) -> CloudResult<W::Done> {
+    pub(super) async fn write<W: VehicleWrite>(
+        &self,
+        vehicle: &str,
+        write: W,
+    ) -> CloudResult<W::Done> {
         let (reply, result) = oneshot::channel();
-        let waiting = (W::WAITING)(Waiting { write, result: None, reply });
+        let vehicle = vehicle.to_owned();
+        let waiting = (W::WAITING)(Waiting { vehicle, write, result: None, reply });
         self.writes.0.send(waiting).await.map_err(|_| stopped())?;
         result.await.map_err(|_| stopped())?
     }
@@ -170,10 +170,7 @@ impl GroupWriter {
 
     /// Applies the writes of a group: the beginnings of connections first, as older connections of
     /// their vehicles do not count any more. An error of a vehicle is the result of its write.
-    ///
-    /// # Errors
-    ///
-    /// An error of the database, which affects all of the group.
+    /// Fails with the database, for all of the group.
     async fn commit(&self, group: &mut [WaitingWrite]) -> CloudResult<()> {
         let mut change = begin(&self.pool, &self.turn).await?;
         let mut vehicles = change.group_vehicles(group).await?;
@@ -197,29 +194,11 @@ impl GroupWriter {
 
 impl StoreChange<'_> {
     async fn group_vehicles(&mut self, group: &[WaitingWrite]) -> CloudResult<GroupVehicles> {
-        let mut vehicles = GroupVehicles::with_capacity(group.len());
         let names: Vec<_> = group.iter().map(WaitingWrite::vehicle).collect();
-        let rows: Vec<VehicleNumbers> = rows_in!(&mut *self.tx;
+        let rows: Vec<GroupVehicle> = rows_in!(self;
             "SELECT name, labels, digest, boot, former_boot, epoch, is_revoked, arrived,
-             generation, is_ahead, is_double, offered FROM vehicles WHERE name IN ()";
-            &names);
-        for row in rows {
-            let (name, labels, digest, boot, former, epoch, is_revoked, ..) = row;
-            let vehicle = GroupVehicle {
-                epoch,
-                is_revoked: is_revoked != 0,
-                arrived: row.7,
-                labels,
-                digest,
-                generation: row.8,
-                is_ahead: row.9,
-                boots: [boot, former],
-                is_double: row.10,
-                offered: row.11,
-            };
-            vehicles.insert(name, vehicle);
-        }
-        Ok(vehicles)
+             generation, is_ahead, is_double, offered FROM vehicles WHERE name IN ($1..)"; &names);
+        Ok(rows.into_iter().map(|row| (row.name.clone(), row)).collect())
     }
 }
 

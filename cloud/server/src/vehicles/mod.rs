@@ -1,14 +1,6 @@
 //! The listener for vehicles: HTTPS, each request but the first with the vehicle's certificate.
-//!
-//! | request | answer |
-//! |---|---|
-//! | `POST /v1/enrol` | [`EnrolReply`], of an [`EnrolRequest`]; without a certificate |
-//! | `POST /v1/renew` | [`EnrolReply`], of a [`RenewRequest`] |
-//! | `GET /v1/link` | the control channel, a WebSocket |
-//! | `GET /v1/deployments/SHA256` | the envelope of a deployment |
-//! | `GET /v1/revisions/DIGEST` | the envelope of a revision |
-//! | `GET /v1/objects/SHA256` | a file of a revision, or the end of it by `Range` |
-//! | `POST /v1/clips`, `PUT /v1/clips/NAME/...` | what is wanted; see [`gleaner_fleet::clips`] |
+//! [`endpoints`] lists the requests, and `docs/api/link.json` describes them; besides, `GET
+//! /v1/link` opens the control channel, a WebSocket.
 
 mod batch;
 mod link;
@@ -17,12 +9,13 @@ use std::sync::Arc;
 
 use axum::body::{Body, Bytes};
 use axum::extract::{DefaultBodyLimit, Extension, Path, Request, State};
-use axum::http::{HeaderMap, header};
+use axum::http::{HeaderMap, Method, header};
 use axum::middleware::{Next, from_fn, from_fn_with_state};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
 use axum::{Json, Router};
 use gleaner_fleet::entrance::{ClientNetwork, PeerConnection};
+use gleaner_fleet::openapi::Endpoint;
 use gleaner_fleet::{EnrolReply, EnrolRequest, FRAME_MAX, RenewRequest};
 use hyper_util::rt::TokioIo;
 use tokio_tungstenite::WebSocketStream;
@@ -39,6 +32,8 @@ const BODY_MAX: usize = 64 << 10;
 /// Buffer for reading frames: with the default of 128 KiB, idle vehicles would take ten times the
 /// memory. Most frames are shorter than this.
 const READ_BUFFER: usize = 1024;
+/// The only request without a certificate.
+const ENROL: &str = "/v1/enrol";
 
 /// The vehicle that sends a request, by its certificate.
 #[derive(Debug, Clone)]
@@ -47,16 +42,34 @@ pub(crate) struct KnownVehicle {
     certificate: String,
 }
 
+/// Returns every request with an answer. All but the first need a certificate.
+pub(crate) fn endpoints() -> Vec<Endpoint<Arc<Cloud>>> {
+    let new = Endpoint::new;
+    let read = |path, what, handler| new(Method::GET, path, None, what, handler).gives_file(OCTETS);
+    let send = |path, what, handler| new(Method::POST, path, None, what, handler);
+    let mut endpoints = vec![
+        send(ENROL, "Gives the first certificate", post(enrol).layer(from_fn(in_time)))
+            .takes::<EnrolRequest>()
+            .gives::<EnrolReply>(),
+        send("/v1/renew", "Gives the next certificate", post(renew).layer(from_fn(in_time)))
+            .takes::<RenewRequest>()
+            .gives::<EnrolReply>(),
+        read("/v1/deployments/{sha256}", "The envelope of a deployment", get(deployment)),
+        read("/v1/revisions/{digest}", "The envelope of a revision", get(revision)),
+        read("/v1/objects/{sha256}", "A file of a revision", get(object)).headers(&["Range"]),
+    ];
+    endpoints.extend(crate::clips::endpoints());
+    endpoints
+}
+
 pub(crate) fn router(cloud: &Arc<Cloud>) -> Router {
-    Router::new()
-        .route("/v1/renew", post(renew).layer(from_fn(in_time)))
-        .route("/v1/link", get(link))
-        .route("/v1/deployments/{sha256}", get(deployment))
-        .route("/v1/revisions/{digest}", get(revision))
-        .route("/v1/objects/{sha256}", get(object))
-        .merge(crate::clips::router())
-        .route_layer(from_fn_with_state(Arc::clone(cloud), guard))
-        .route("/v1/enrol", post(enrol).layer(from_fn(in_time)))
+    let known = from_fn_with_state(Arc::clone(cloud), guard);
+    let mut router = Router::new().route("/v1/link", get(link).route_layer(known.clone()));
+    for Endpoint { path, handler, .. } in endpoints() {
+        let guarded = if path == ENROL { handler } else { handler.route_layer(known.clone()) };
+        router = router.route(path, guarded);
+    }
+    router
         .fallback(async || CloudError::missing("there is nothing under this path", "see the docs"))
         .layer(DefaultBodyLimit::max(BODY_MAX))
         .with_state(Arc::clone(cloud))

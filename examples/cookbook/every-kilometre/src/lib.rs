@@ -17,7 +17,7 @@ impl Lambda for EveryKilometre {
         let forward = input("speed")?.field("twist.linear.x")?;
         let driven_m = match scratch::get(ODOMETER, 0, 8) {
             Ok(bytes) => bytes.try_into().map(f64::from_le_bytes).unwrap_or(0.0),
-            Err(error) if error.kind() == Some("no-such-entry") => 0.0,
+            Err(error) if error.is(scratch::ScratchErrorKind::NoSuchEntry) => 0.0,
             Err(error) => return Err(error),
         };
         Ok(Self {

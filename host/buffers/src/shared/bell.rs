@@ -24,7 +24,6 @@ pub trait Futex {
 pub struct Bell(MappedControl);
 
 impl Bell {
-    /// The bell of a control page.
     pub fn of(memory: impl ControlMemory) -> Self {
         Self(MappedControl::new(memory))
     }

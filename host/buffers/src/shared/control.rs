@@ -18,7 +18,6 @@ const _: () = assert!(size_of::<ControlPage>() == CONTROL_BYTES);
 #[cfg(not(loom))]
 const CONTROL_BYTES: usize = 529 << 12;
 
-/// Hazard words of a control page.
 #[cfg(not(loom))]
 pub const HAZARDS: usize = (CONTROL_BYTES - 64) / 8;
 /// A few of them in a model, which creates each of them in every order.
@@ -112,7 +111,6 @@ impl ControlPage {
 /// a mapped page of this type, aligned to a cache line, that is valid for atomic reads and writes
 /// from any thread. Other processes may write it.
 pub unsafe trait ControlMemory: Send + Sync + 'static {
-    /// The first byte of the page.
     fn page(&self) -> NonNull<ControlPage>;
 
     /// Stores `value` in a hazard word, as every process that maps the page can.

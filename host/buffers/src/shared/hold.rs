@@ -171,7 +171,6 @@ pub struct HeldSample {
 }
 
 impl HeldSample {
-    /// Position of the sample.
     pub fn position(&self) -> u64 {
         self.found().position
     }

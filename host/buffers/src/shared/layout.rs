@@ -13,7 +13,6 @@ pub const META_WORDS: usize = 12;
 #[cfg(loom)]
 pub const META_WORDS: usize = 1;
 
-/// Words of counters in the header.
 pub(super) const COUNTER_WORDS: usize = 8;
 
 /// Alignment of each payload: a cache line, and any vector type.
@@ -27,7 +26,6 @@ const PAGE: usize = 4096;
 pub struct SharedLayout {
     /// Samples that the topic shows at most.
     pub depth: u32,
-    /// Slots for samples.
     pub slots: u32,
     /// Bytes of the largest sample.
     pub slot_bytes: u64,
@@ -72,7 +70,6 @@ impl SharedLayout {
     }
 }
 
-/// The first words of a region.
 #[repr(C, align(64))]
 pub(super) struct HeaderWords {
     /// Number of samples published.
@@ -124,7 +121,6 @@ impl WriterMemory {
 }
 
 impl ReaderMemory {
-    /// Returns the memory of readers, as above.
     pub fn new(region: impl ReadRegion, layout: SharedLayout) -> Option<Self> {
         let region = Box::new(region);
         let (base, len) = (region.base(), region.len());
@@ -150,7 +146,6 @@ pub fn in_process(layout: SharedLayout) -> Result<(WriterMemory, ReaderMemory), 
     Ok((WriterMemory(writing), ReaderMemory(crate::sync::Arc::new(reading))))
 }
 
-/// A mapped region and its layout.
 pub(super) struct SharedMemory {
     layout: SharedLayout,
     stride: usize,

@@ -75,7 +75,6 @@ impl SharedReader {
         self.0.memory.layout().depth
     }
 
-    /// Counters of the writer.
     pub fn counters(&self) -> [u64; COUNTER_WORDS] {
         let counters = &self.0.memory.header().counters;
         std::array::from_fn(|index| counters[index].load(Ordering::Relaxed))

@@ -14,25 +14,19 @@ use crate::sync::Ordering;
 /// A sample or a reader that the topic has no room for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum WriteError {
-    /// The sample is larger than a slot.
     TooBig {
-        /// Length of the sample in bytes.
         len: usize,
-        /// Bytes of a slot.
         max: usize,
     },
     /// The quotas of all readers would exceed the slots that are not warm.
     Quota {
-        /// Positions that the reader asks to hold.
         asked: u32,
-        /// Positions that are left.
         left: u32,
     },
     /// The words are not on the control page.
     Hazards,
 }
 
-/// Identifies a reader of one topic.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ReaderId(u64);
 

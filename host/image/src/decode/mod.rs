@@ -22,7 +22,6 @@ pub use message::probe_message;
 
 use super::{Encoding, ImageError, PixelError, StopCheck};
 
-/// Format of an image file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Format {
     /// JPEG (ITU-T T.81), baseline or progressive.
@@ -40,10 +39,8 @@ impl fmt::Display for Format {
     }
 }
 
-/// Content of the header of an image file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ImageHeader {
-    /// Format of the file.
     pub format: Format,
     /// Pixels per row, 1 to [`MAX_SIDE`](super::MAX_SIDE).
     pub width: u32,

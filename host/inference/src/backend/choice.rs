@@ -8,7 +8,6 @@ use crate::inspect::ModelSignature;
 /// Names in the manifest.
 const KNOWN: &str = "cpu, cuda, tensorrt, rten and onnxruntime";
 
-/// The backends of this process.
 pub struct Backends {
     rten: Box<dyn Backend>,
     onnx_runtime: Result<Box<dyn Backend>, String>,
@@ -16,7 +15,6 @@ pub struct Backends {
 
 /// A loaded model, with the reason for its backend.
 pub struct ChosenGraph {
-    /// The model.
     pub graph: Box<dyn LoadedGraph>,
     /// Backend, version, provider and threads, such as `rten 0.27.0, cpu, 1 thread`.
     pub runtime: String,

@@ -29,9 +29,7 @@ pub use tensorrt::EngineUse;
 /// A device and the code for it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ExecutionProvider {
-    /// The processor.
     Cpu,
-    /// NVIDIA GPUs.
     Cuda,
     /// NVIDIA GPUs, with code generated for the model.
     TensorRt,
@@ -48,12 +46,9 @@ impl ExecutionProvider {
     }
 }
 
-/// Options of a model.
 #[derive(Debug, Clone, Copy)]
 pub struct LoadOptions<'a> {
-    /// Device.
     pub provider: ExecutionProvider,
-    /// Number of threads of one run.
     pub threads: u32,
     /// Inputs and outputs, from the file.
     pub signature: &'a ModelSignature,
@@ -98,12 +93,9 @@ pub trait LoadedGraph: Send {
     ) -> Result<Vec<TensorValue>, BackendError>;
 }
 
-/// The values of a tensor.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct TensorValue {
-    /// Type of the elements.
     pub element: Element,
-    /// Length of each dimension.
     pub shape: Vec<u32>,
     /// The elements, little-endian, in row-major order. Bytes of booleans are 0 or 1.
     pub bytes: Vec<u8>,
@@ -115,7 +107,6 @@ pub struct TensorValue {
 pub struct BackendError(String);
 
 impl BackendError {
-    /// Uses the text of an error.
     pub fn new(reason: impl fmt::Display) -> BackendError {
         BackendError(reason.to_string())
     }
@@ -139,7 +130,6 @@ impl StopSignal {
         action.map(|action| action()).is_some()
     }
 
-    /// Returns whether the end was requested.
     pub fn is_stopped(&self) -> bool {
         self.is_stopped.load(Ordering::SeqCst)
     }

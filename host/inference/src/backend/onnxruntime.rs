@@ -21,7 +21,6 @@ use super::{
     Backend, BackendError, ExecutionProvider, LoadOptions, LoadedGraph, StopSignal, TensorValue,
 };
 
-/// The backend of ONNX Runtime.
 #[derive(Debug)]
 pub struct OnnxRuntime {
     environment: Environment,

@@ -18,7 +18,6 @@ use crate::inspect::{OutputInfo, RtenFinding, RtenRuleKind};
 /// The version of rten, as the workspace pins it.
 const VERSION: &str = "rten 0.27.0";
 
-/// The backend of rten.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct RtenBackend;
 

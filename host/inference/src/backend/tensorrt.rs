@@ -13,15 +13,11 @@ use super::{Backend, BackendError, LoadOptions, LoadedGraph};
 /// The command that builds engines.
 const BUILD: &str = "gleaner check DIR --build-engines";
 
-/// The use of an engine.
 #[derive(Debug, Default)]
 pub enum EngineUse {
-    /// There is none.
     #[default]
     None,
-    /// It was built before.
     Built(BuiltEngine),
-    /// It must not be used, for this reason.
     Refused(String),
     /// It is built, and written to this file.
     Build(PathBuf),

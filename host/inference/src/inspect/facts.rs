@@ -242,7 +242,6 @@ impl<'a> GraphFacts<'a> {
         Ok(attribute)
     }
 
-    /// Returns the facts of a value that is declared.
     pub(super) fn value(&self, name: &str) -> Option<&ValueFacts> {
         self.values.get(name)
     }
@@ -392,5 +391,4 @@ const SMALL: usize = 64;
 const FLOAT32: i64 = 1;
 pub(super) const INT64: i64 = 7;
 
-/// The type of booleans.
 pub(super) const BOOLEAN: i64 = 9;

@@ -51,7 +51,6 @@ mod model_field {
 
 /// The reason why a model is refused before it is loaded.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[allow(missing_docs)]
 pub enum InspectError {
     #[error("it is no ONNX model: it is no protobuf message with a version and a graph")]
     NoModel,

@@ -19,7 +19,6 @@ pub struct RtenRule {
     pub when: &'static str,
     /// The result of rten.
     pub computes: &'static str,
-    /// The models or runs that are refused.
     pub kind: RtenRuleKind,
     applies: RuleCondition,
 }
@@ -40,7 +39,6 @@ pub enum RtenRuleKind {
 /// A rule that holds for a node of a model.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RtenFinding {
-    /// The models or runs that are refused.
     pub kind: RtenRuleKind,
     /// The operator, the reason, and the way out.
     pub message: String,
@@ -61,7 +59,6 @@ const fn always(operators: &'static [&'static str], computes: &'static str) -> R
     rule(operators, "always", computes, |_, _| true)
 }
 
-/// All rules.
 pub const RTEN_RULES: &[RtenRule] = &[
     always(
         &["NonMaxSuppression"],

@@ -18,7 +18,6 @@ const ELEMENTS: &str = "float32 uint8 int8 uint16 int16 int32 int64 string boole
 pub struct ModelSignature {
     /// Its inputs, without those that have a default value.
     pub inputs: Vec<TensorInfo>,
-    /// Its outputs.
     pub outputs: Vec<OutputInfo>,
     /// Rules of rten that hold for it.
     pub rten: Vec<RtenFinding>,
@@ -26,7 +25,6 @@ pub struct ModelSignature {
     pub metadata: Vec<(String, String)>,
 }
 
-/// An output of a model.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct OutputInfo {
     /// Name, type and shape; an empty shape if it is not declared.

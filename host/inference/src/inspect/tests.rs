@@ -16,12 +16,10 @@ fn info(name: &str, element: Element, shape: &[Option<u32>]) -> TensorInfo {
     TensorInfo { name: name.to_owned(), element, shape: shape.to_vec() }
 }
 
-/// A graph of one node.
 fn with_node(node: Proto) -> Proto {
     graph(&[node], &[], &[value("x", FLOAT32, &[1])], &[value("y", FLOAT32, &[1])])
 }
 
-/// A graph with one input.
 fn with_input(input: Proto) -> Vec<u8> {
     model(&graph(&[], &[], &[input], &[value("y", FLOAT32, &[1])]))
 }

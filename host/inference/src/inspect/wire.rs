@@ -1,7 +1,6 @@
 //! Reads the fields of a protobuf message in place: no byte is copied, and no memory is taken for a
 //! length before that many bytes are there.
 
-/// The bytes are no protobuf message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("it is no protobuf message")]
 pub(super) struct NoMessage;

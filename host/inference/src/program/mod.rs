@@ -35,7 +35,6 @@ use args::Args;
 
 const OWN_THREADS: &str = "/proc/self/task";
 
-/// Runs the program `gleaner-inference`.
 pub fn main() -> ExitCode {
     main_with(open)
 }

@@ -34,7 +34,6 @@ use topics::TopicsArgs;
 const REAL_TIME_HELP: &str = "it needs `ulimit -r 1` or CAP_SYS_NICE; in a service, \
                               `LimitRTPRIO=1` and `RestrictRealtime=no`";
 
-/// Runs the program `gleaner-ingress`.
 pub fn main() -> ExitCode {
     log::init_service();
     let mut args = Args::parse();

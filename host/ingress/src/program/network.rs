@@ -11,7 +11,6 @@ pub(super) fn warn_of_variables() {
     }
 }
 
-/// A DDS error, for users.
 #[derive(Debug, thiserror::Error)]
 #[error(transparent)]
 pub(super) struct NetworkError(DdsError);

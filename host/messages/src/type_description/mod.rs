@@ -37,7 +37,6 @@ const NUMBERS: [&str; 10] = [
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct RequestHeader(pub [u64; 2]);
 
-/// Definitions from the description of a node.
 #[derive(Debug)]
 pub struct DescribedDefinitions {
     /// The text of the type and all types it refers to, as [`Definitions::parse`] expects it.
@@ -49,7 +48,6 @@ pub struct DescribedDefinitions {
 
 /// Reasons why a response cannot be used.
 #[derive(Debug, thiserror::Error)]
-#[allow(missing_docs)]
 pub enum TypeDescriptionError {
     #[error("cannot parse the response: {0}")]
     Cdr(#[from] CdrError),

@@ -105,7 +105,6 @@ pub(super) mod steps {
         STEPS.set((Vec::new(), last));
     }
 
-    /// Returns the steps so far.
     pub fn taken() -> Vec<String> {
         STEPS.with_borrow(|(taken, _)| taken.clone())
     }

@@ -131,7 +131,6 @@ impl RecordingFolder {
         self.dir.unsigned()
     }
 
-    /// Returns the list of losses, `losses.jsonl`.
     pub fn losses(&self) -> Arc<LossList> {
         Arc::clone(&self.losses)
     }

@@ -9,7 +9,6 @@ use gleaner_protocol::link::Loss;
 
 use crate::error::RecordError;
 
-/// The list of losses.
 #[derive(Debug)]
 pub struct LossList {
     path: PathBuf,

@@ -12,7 +12,6 @@ pub(super) enum Origin {
     /// Unknown: nothing was written yet, or none of it reached the disk. The file is empty, zeros,
     /// or truncated within our header.
     Nothing,
-    /// Another program.
     Foreign,
 }
 

@@ -37,7 +37,6 @@ const IN_COMMON: usize = 24;
 pub struct FalseStatement {
     /// The record and the key.
     pub what: String,
-    /// The statement.
     pub stated: String,
     /// The value that follows from the rest of the clip.
     pub found: String,

@@ -347,7 +347,6 @@ impl Preroll {
         }
     }
 
-    /// Returns the peak of the bytes in use.
     pub fn bytes_highest(&self) -> u64 {
         self.highest
     }

@@ -22,7 +22,6 @@ pub struct DefinitionsRequest {
     pub type_name: String,
 }
 
-/// The health of the disk and of this process.
 #[derive(Default)]
 pub struct SystemHealth {
     pub disk_free: Option<u64>,

@@ -25,7 +25,6 @@ const INBOX: usize = 64;
 
 /// An event for the loop, other than samples and messages of lambdas.
 pub enum LoopEvent {
-    /// A lambda was announced.
     Registered(Box<Registration>),
     /// A lambda was announced and refused; the reason was sent to it.
     Refused,
@@ -34,7 +33,10 @@ pub enum LoopEvent {
     /// The loop has to end, and the lambdas join another recorder.
     GiveWay,
     /// Definitions of a topic on this machine, by the id of its grant.
-    Definitions { id: u32, text: Option<Arc<str>> },
+    Definitions {
+        id: u32,
+        text: Option<Arc<str>>,
+    },
     /// The checks of each second.
     Health(SystemHealth),
 }

@@ -50,12 +50,10 @@ use crate::RecordError;
 use args::Args;
 pub use event_loop::run;
 
-/// Options of the process.
 #[derive(Clone, Debug)]
 pub struct RecorderOptions {
     /// The folder of clips and their list.
     pub out: PathBuf,
-    /// The clock of samples and wakes.
     pub clock: Clock,
     /// Places of message definitions, which are searched before those that the source carries.
     pub messages: Sources,
@@ -63,7 +61,6 @@ pub struct RecorderOptions {
     pub preroll_bytes: Option<u64>,
     /// Bytes of the disk to keep free.
     pub disk_floor: u64,
-    /// Maximum number of clips to keep.
     pub clips_max: Option<u64>,
     /// Maximum total size of clips to keep, in bytes.
     pub bytes_max: Option<u64>,
@@ -71,12 +68,10 @@ pub struct RecorderOptions {
     pub commands: Option<String>,
 }
 
-/// Connections of the process.
 #[derive(Debug)]
 pub struct RecorderConnections {
     /// Requests of the starter.
     pub control: OwnedFd,
-    /// The connection to the ingress.
     pub ingress: OwnedFd,
     /// The socket over which the starter passes connections to later ingresses; without one, the
     /// recorder ends with the ingress.
@@ -85,7 +80,6 @@ pub struct RecorderConnections {
     pub signer: Option<ClipSigner>,
 }
 
-/// Runs the program `gleaner-recorder`.
 pub fn main() -> ExitCode {
     log::init_service();
     match start(Args::parse()) {

@@ -84,7 +84,6 @@ impl Topics {
         Topics { feed, searches, topics: Vec::new(), early: BTreeMap::new() }
     }
 
-    /// The newest state of the source.
     pub fn status(&self) -> &SourceStatus {
         self.feed.status()
     }

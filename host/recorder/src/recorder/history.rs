@@ -31,7 +31,6 @@ pub struct History {
     now: Option<i64>,
     /// Samples evicted before they were old enough.
     evicted_early: u64,
-    /// Samples that do not fit.
     too_big: u64,
     /// Times without an ingress: begin and end, which is unknown while one lasts.
     outages: VecDeque<(i64, Option<i64>)>,
@@ -122,7 +121,6 @@ impl History {
         Ok(())
     }
 
-    /// Drops entries older than `before`.
     pub fn trim(&mut self, before: i64) -> Result<(), RecordError> {
         let History { preroll, topics, wakes, .. } = self;
         preroll.trim(before, &mut |held| {

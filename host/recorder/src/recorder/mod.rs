@@ -296,7 +296,6 @@ impl Recorder {
         self.clips.progress().finished().newest()
     }
 
-    /// The counts so far.
     pub fn counts(&self) -> RecorderCounts {
         let preroll = self.material.history.preroll();
         let (evicted_early, too_big) = self.material.history.counts();

@@ -6,10 +6,8 @@ use std::time::Duration;
 use gleaner_lambda::manifest::Store;
 use gleaner_protocol::RecordingCounts;
 
-/// Settings of a recorder.
 #[derive(Clone, Debug)]
 pub struct Settings {
-    /// The store of the preroll.
     pub store: Store,
     /// Most bytes of the preroll, with 64 bytes or a little more for each sample.
     pub preroll_bytes: u64,
@@ -23,7 +21,6 @@ pub struct Settings {
     pub prefault: bool,
 }
 
-/// A topic of a recorder.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct TopicId(usize);
 
@@ -37,7 +34,6 @@ impl TopicId {
     }
 }
 
-/// A lambda of a recorder.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct LambdaId(usize);
 
@@ -51,24 +47,21 @@ impl LambdaId {
     }
 }
 
-/// Counts of a recorder.
 #[derive(Copy, Clone, Debug, Default, PartialEq, Eq)]
 pub struct RecorderCounts {
-    /// The reported counts.
     pub recording: RecordingCounts,
     /// Samples older than an earlier one. They are recorded if windows cover them.
     pub out_of_order: u64,
     /// Bytes that the preroll holds.
     pub preroll_bytes: u64,
-    /// The most that it held so far.
+    /// The most bytes that it held so far.
     pub preroll_highest: u64,
-    /// The most that it may hold.
+    /// The most bytes that it may hold.
     pub preroll_bound: u64,
     /// Bytes queued for the writer thread; 0 if there is none.
     pub in_flight: u64,
 }
 
-/// The result of a command.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum Commanded {
     /// It opened a window.
@@ -81,7 +74,6 @@ pub enum Commanded {
     DiskSuppressed,
 }
 
-/// The pending work of a live recorder.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum Work {
     /// Nothing.

@@ -21,7 +21,6 @@ pub const TOPICS_MAX: usize = 1024;
 /// the list of clips, up to seven times and with six bytes for one, and a line has at most 16 MiB.
 const NAMES_MAX: usize = 256 << 10;
 
-/// A lambda to record for.
 #[derive(Clone, Debug)]
 pub struct LambdaSpec {
     /// Its description, the header of its journal.
@@ -212,7 +211,6 @@ impl RecordedSources {
         &self.lambdas[lambda].header
     }
 
-    /// Replaces the engine in the header of a lambda.
     pub fn set_engine(&mut self, lambda: usize, engine: String) {
         Arc::make_mut(&mut self.lambdas[lambda].header).engine = engine;
     }

@@ -28,7 +28,6 @@ enum TriggeredBy {
     Command,
 }
 
-/// A step of the recorder.
 #[derive(Debug, PartialEq, Eq)]
 pub enum WindowStep {
     /// A clip begins, with these windows; [`Windows::open`] has their group.
@@ -45,7 +44,6 @@ pub enum WindowStep {
     Roll {
         /// Last instant of the full clip.
         boundary: i64,
-        /// The group as it was.
         before: Box<Group>,
     },
     /// No window can touch the open clip any more: it is complete.
@@ -55,7 +53,6 @@ pub enum WindowStep {
     Late(Vec<Window>, Box<Group>),
 }
 
-/// The windows of all lambdas.
 #[derive(Debug, Default)]
 pub struct Windows {
     lambdas: Vec<WindowLambda>,
@@ -337,7 +334,6 @@ impl Windows {
         self.grace_ns = grace_ns;
     }
 
-    /// Sets the maximum length of a clip, in ns.
     pub fn grow_length(&mut self, max_length_ns: i64) {
         self.max_length_ns = max_length_ns;
     }

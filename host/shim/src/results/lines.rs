@@ -42,7 +42,6 @@ impl LineSplitter {
         cost
     }
 
-    /// Returns whether a line is unfinished.
     pub(crate) fn is_within(&self) -> bool {
         !self.line.is_empty()
     }

@@ -17,7 +17,6 @@ use crate::api::call_time::CallTime;
 /// `memory` of the lambda.
 const MEMORY: u64 = 1 << 20;
 
-/// A reply of the other end.
 enum Sent {
     /// A result, with a region if one is named by its size.
     Result(Result<ModelResult, ModelFault>, Option<u64>),

@@ -23,7 +23,6 @@ const ONE_THREAD: [&str; 4] =
 
 /// A Python interpreter that cannot be started.
 #[derive(Debug, thiserror::Error)]
-#[allow(missing_docs)]
 pub enum PythonError {
     #[error(transparent)]
     Parts(#[from] PartsError),

@@ -1,5 +1,4 @@
 //! Bindings that wasmtime generates from `wit/`, with the host's types behind the handles.
-#![allow(missing_docs)]
 
 use std::sync::Arc;
 

@@ -21,9 +21,7 @@ use super::bindings::{Lambda, LambdaPre};
 use super::data::add_reads_to_linker;
 use super::wasi;
 
-/// A component that cannot be loaded.
 #[derive(Debug, thiserror::Error)]
-#[allow(missing_docs)]
 pub enum WasmError {
     #[error(transparent)]
     Compile(#[from] CompileError),
@@ -164,7 +162,6 @@ impl Loaded {
         linker.instantiate_pre(code).and_then(LambdaPre::new).map_err(world)
     }
 
-    /// The engine it runs on.
     pub fn engine(&self) -> &Engine {
         &self.engine
     }

@@ -37,10 +37,8 @@ const NAMES: &str = "wasi:sockets/ip-name-lookup@0.2.12";
 const RANDOM_BYTES: u64 = 4096;
 /// Fuel for a random byte: each is generated separately.
 const FUEL_PER_RANDOM_BYTE: u64 = 4;
-/// Fuel for each pollable that a call waits for.
 const FUEL_PER_POLLABLE: u64 = 400;
 
-/// The lambda tried to sleep.
 #[derive(Debug, thiserror::Error)]
 #[error("a lambda cannot sleep: it is woken by samples or by a period")]
 pub(super) struct SleepError;

@@ -39,14 +39,18 @@ const MESSAGE_MAX: u64 = 4 << 20;
 #[serde(rename_all = "snake_case")]
 enum WorkerMessage {
     /// Sent first: the process is sandboxed, and no code of the lambda has run yet.
-    Ready { engine: LambdaEngine, layers: Vec<Layer> },
+    Ready {
+        engine: LambdaEngine,
+        layers: Vec<Layer>,
+    },
     /// A line that the lambda logged; sent before the message of the call that it belongs to.
-    Log { level: Level, message: String },
+    Log {
+        level: Level,
+        message: String,
+    },
     /// The start-up code of the lambda's environment has ended.
     Prepared(CallOutcome),
-    /// `init` has ended.
     Initialised(CallOutcome),
-    /// A wake has ended.
     Woken(WakeMessage),
     /// The drive has ended.
     Done(TotalsMessage),

@@ -94,7 +94,6 @@ pub(super) struct WorkerExit {
 pub(super) enum NoMessage {
     /// The process has ended, or has closed its standard output.
     Ended,
-    /// The message is malformed.
     Malformed(String),
 }
 

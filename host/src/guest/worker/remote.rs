@@ -19,7 +19,6 @@ use crate::api::log::{LINE_BYTES, Level, cut};
 use crate::api::trace::offered;
 use crate::guest::{Guest, LambdaEngine, Totals, WakeOutcome};
 
-/// A guest in a worker.
 pub struct RemoteGuest {
     /// `None` once it has ended.
     worker: Option<WorkerProcess>,
@@ -210,7 +209,6 @@ fn is_possible(curve: &Curve, inputs: &[Arc<Topic>]) -> bool {
             .any(|topic| topic.name() == curve.input && topic.ros_topic() == curve.topic)
 }
 
-/// A worker that did not become ready.
 pub enum WorkerStartError {
     /// It has printed the error, and ended with this exit.
     Explained(Exit),

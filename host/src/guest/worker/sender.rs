@@ -15,7 +15,6 @@ use crate::api::Session;
 use crate::api::data::Wake;
 use crate::guest::{Guest, LambdaEngine, Totals, WakeOutcome};
 
-/// The writing end of a worker's messages.
 #[derive(Clone)]
 pub struct MessageSender(Arc<Mutex<MessageWriter>>);
 

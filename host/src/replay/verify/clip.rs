@@ -157,7 +157,6 @@ fn losses(stated: &ClipStatements, is_live: bool) -> Option<String> {
     (!lost.is_empty()).then(|| lost.join(", "))
 }
 
-/// The loop of a comparison over a clip.
 struct ClipVerifyLoop<'a> {
     header: &'a JournalHeader,
     rerun: Rerun,
@@ -172,7 +171,6 @@ struct ClipVerifyLoop<'a> {
     interrupted: u64,
     /// Set if the journal was written live.
     is_live: bool,
-    /// Losses that the clip states.
     losses: Option<String>,
     triggers: JournalTriggers,
 }

@@ -139,7 +139,6 @@ impl Rerun {
     }
 }
 
-/// Returns the difference of two counts, if they differ.
 fn counts_differ(what: impl Into<String>, journal: u64, now: u64) -> Option<Difference> {
     (journal != now).then(|| Difference {
         what: what.into(),

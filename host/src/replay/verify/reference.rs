@@ -54,7 +54,6 @@ impl ReferenceJournal {
         self.header().clock != CLOCK_OF_DRIVE
     }
 
-    /// The file that contains it.
     pub(in crate::replay) fn path(&self) -> &Path {
         &self.path
     }

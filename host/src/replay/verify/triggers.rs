@@ -10,7 +10,6 @@ use super::counts_differ;
 /// Maximum number of triggers that a clip lists.
 const KEPT: usize = 10_000;
 
-/// The triggers in a part of a journal.
 pub(super) struct JournalTriggers {
     lambda: String,
     pub(super) count: u64,

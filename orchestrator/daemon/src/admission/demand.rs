@@ -41,7 +41,6 @@ const ACCELERATED: [&str; 2] = ["tensorrt", "cuda"];
 pub(crate) enum DemandSource {
     /// It follows from the manifest's limits and inputs.
     Limits,
-    /// The manifest states it.
     Stated,
     /// It was measured on this vehicle.
     Measured,

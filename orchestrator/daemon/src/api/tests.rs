@@ -58,3 +58,15 @@ fn odd_ids_are_refused_and_leave_all_files() {
     assert_eq!(std::fs::read(state.join("state.json")).unwrap(), before);
     assert!(["records", "clips", "spool"].iter().all(|name| state.join(name).is_dir()));
 }
+
+#[test]
+fn the_committed_description_is_that_of_the_api() {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/api/vehicle.json");
+    let what = "The API of a vehicle, on a socket of it.";
+    let described = gleaner_fleet::openapi::describe("Gleaner vehicle", what, &endpoints());
+    if std::env::var_os("GLEANER_BLESS").is_some() {
+        std::fs::write(path, &described).unwrap();
+    }
+    let is_same = std::fs::read_to_string(path).unwrap() == described;
+    assert!(is_same, "run `cargo xtask bless`, which writes docs/api/vehicle.json");
+}

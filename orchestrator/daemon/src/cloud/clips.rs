@@ -36,7 +36,6 @@ const RATE: f64 = 8e6;
 /// Time for the answer to the last piece of a file: the cloud compares all of it first.
 const COMPARING: Duration = Duration::from_secs(600);
 
-/// The task.
 pub(super) struct ClipSender {
     pub(super) core: Arc<Core>,
     pub(super) folder: ClipFolder,

@@ -28,7 +28,6 @@ pub(super) struct Download<'d> {
     pub(super) sha256: &'d Sha256,
     /// Its length, as it was signed.
     pub(super) length: u64,
-    /// The path for the whole file.
     pub(super) target: PathBuf,
 }
 

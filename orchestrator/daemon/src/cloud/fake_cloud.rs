@@ -31,7 +31,6 @@ pub(super) async fn soon<T>(event: impl Future<Output = T>) -> T {
 }
 
 pub(super) struct FakeCloud {
-    /// The client for it.
     pub(super) http: CloudHttp,
     /// Its certificate and its key, as PEM.
     pub(super) identity: [String; 2],
@@ -178,7 +177,6 @@ impl ControlChannel {
         }
     }
 
-    /// Waits for the report about a wanted state.
     pub(super) async fn reported(&mut self, generation: u64) -> Reported {
         let is_of = |body| match body {
             Body::Reported(reported) if reported.generation == generation => Some(reported),

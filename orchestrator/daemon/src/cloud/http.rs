@@ -40,7 +40,6 @@ const RATE_MIN: u64 = 14_000;
 /// Longest answer without a file.
 const ANSWER_MAX: u64 = 64 << 10;
 
-/// The cloud at one address.
 #[derive(Clone)]
 pub(super) struct CloudHttp {
     pub(super) address: String,

@@ -40,7 +40,6 @@ const EARLY: Duration = Duration::from_secs(10);
 const LOOKS: Duration = Duration::from_secs(2);
 /// Interval of counts of the records that wait.
 const COUNT_INTERVAL: Duration = Duration::from_secs(2);
-/// Interval of attempts to get the next certificate.
 const RENEWAL_INTERVAL: Duration = Duration::from_secs(3600);
 /// Longest life of a connection, in s: the time to the renewal is measured again with the next one.
 const RENEWAL_MAX_S: u64 = 30 * 86_400;

@@ -167,7 +167,6 @@ impl Cloud {
         was_connected
     }
 
-    /// Returns the losses of all streams.
     pub(crate) fn records_lost(&self) -> Vec<StreamLoss> {
         self.lock().counts.lost.clone()
     }

@@ -277,7 +277,6 @@ fn kind_of(problem: &WantedProblem) -> EventKind {
     if problem.is_pending { EventKind::Warning } else { EventKind::Refused }
 }
 
-/// Returns the problem of a step that failed.
 fn problem(deployment: String, envelope: String, failure: Failure) -> WantedProblem {
     let Failure { exit, message, causes, help } = failure;
     WantedProblem {

@@ -41,7 +41,6 @@ const REPORT_MAX: Duration = Duration::from_secs(60);
 /// Number of frames about records that wait for the thread that sends these. It has one batch of
 /// each stream on its way, so that a cloud that follows the rules does not send more.
 const UPLINK_ORDERS: usize = 4096;
-/// Largest number of a wanted state.
 const GENERATION_MAX: u64 = 1 << 60;
 /// Bounds of the interval of signs of life, in s, whatever the cloud asks for.
 const PING_S: std::ops::RangeInclusive<u32> = 5..=300;

@@ -34,7 +34,6 @@ const RATE: RateLimit = RateLimit::of(262_144.0, 2_097_152.0);
 /// Pause before a stream that failed is opened again: each try may read all of it.
 const UNOPENED: Duration = Duration::from_secs(16);
 
-/// The thread.
 pub(super) struct Uplink<P: SpoolSource = SpoolFolders> {
     spools: P,
     cloud: Cloud,
@@ -55,7 +54,6 @@ pub(super) enum UplinkOrder {
     Tail(TailLease),
 }
 
-/// The last try of a stream that failed.
 #[derive(Debug, Clone)]
 pub(super) struct FailedTry {
     /// The error at the root.

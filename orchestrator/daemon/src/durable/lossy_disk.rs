@@ -9,7 +9,6 @@ use std::path::{Path, PathBuf};
 use gleaner_base::WriteSteps;
 use rustix::io::Errno;
 
-/// The fault of an operation.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum StepFault {
     /// It fails once, with this error.
@@ -20,7 +19,6 @@ pub(super) enum StepFault {
     PowerCut,
 }
 
-/// The content of all files, by name.
 pub(super) type DiskImage = BTreeMap<PathBuf, Vec<u8>>;
 
 #[derive(Default)]

@@ -3,6 +3,7 @@
 use std::fs::File;
 use std::os::unix::fs::FileExt;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// A report.
@@ -35,7 +36,7 @@ pub struct TryLoad {
 }
 
 /// A model that is loaded once for all lambdas that name it with the same options.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct LoadedModel {
     /// SHA-256 of the file.
     pub sha256: String,
@@ -71,7 +72,7 @@ pub struct LoadedModel {
 }
 
 /// Memory that a model took in a process without others, in bytes; zeros if that is unknown.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct ModelMemory {
     /// After its load and first run.
     pub held: u64,
@@ -80,7 +81,7 @@ pub struct ModelMemory {
 }
 
 /// State of a model.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum ModelState {
     /// It is being checked, loaded and run for the first time.
@@ -93,7 +94,7 @@ pub enum ModelState {
 }
 
 /// The status of the process.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct InferenceStatus {
     /// All models.
     pub models: Vec<LoadedModel>,

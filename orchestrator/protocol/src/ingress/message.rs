@@ -170,7 +170,7 @@ pub struct TopicInfo {
 }
 
 /// The status of the ingress.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct IngressStatus {
     /// State of the source.
     pub health: Health,
@@ -186,7 +186,7 @@ pub struct IngressStatus {
 }
 
 /// A topic that the ingress has subscribed.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct IngressTopic {
     /// Its name on the network.
     pub topic: String,

@@ -23,7 +23,7 @@ pub enum Qos {
 }
 
 /// State of a subscription.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct ReceptionStatus {
     /// Number of connected writers; `None` where there are none, as in a replay. A killed writer
     /// counts until its lease expires, with ROS 2 often after 10 to 20 s.
@@ -45,7 +45,7 @@ pub struct ReceptionStatus {
 }
 
 /// The state of a live source.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct Health {
     /// State of the network below; `None` without one.
     pub network: Option<NetworkStatus>,

@@ -76,7 +76,7 @@ pub enum Loss {
 
 /// The status of the recorder. Counts are since its start; durations are since the previous report,
 /// and in the last report since the start.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct RecorderStatus {
     /// Number of connected lambdas.
     pub lambdas: usize,
@@ -156,7 +156,7 @@ impl RecorderStatus {
 }
 
 /// Counts of commands.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct CommandStatus {
     /// Topic of the commands.
     pub topic: String,
@@ -171,7 +171,7 @@ pub struct CommandStatus {
 }
 
 /// A recorded topic. `None` means unknown.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct RecordedTopic {
     /// The topic.
     pub topic: String,

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::inference::InferenceStatus;
@@ -41,7 +42,7 @@ pub struct Welcome {
 }
 
 /// The status of all processes.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct SupervisorStatus {
     /// Generation of the newest wanted state that was received.
     pub generation: u64,
@@ -74,7 +75,7 @@ pub struct SupervisorStatus {
 }
 
 /// Number and size of clips.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct ClipCounts {
     /// Their number.
     pub clips: u64,
@@ -83,7 +84,7 @@ pub struct ClipCounts {
 }
 
 /// The status of a process that all lambdas share.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct ProcessStatus<S> {
     /// True while it runs and is ready.
     pub is_ready: bool,
@@ -111,7 +112,7 @@ impl<S> ProcessStatus<S> {
 }
 
 /// The status of a lambda.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct LambdaStatus {
     /// Id of its deployment.
     pub id: String,
@@ -157,7 +158,7 @@ impl LambdaStatus {
 }
 
 /// Phase of a lambda.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum LambdaPhase {
     /// It waits for its start: for the ingress, or after an end.

@@ -26,7 +26,6 @@ pub(super) struct Client {
 /// after either of them.
 pub(super) enum ProcessState {
     Started,
-    /// It has ended, for this reason.
     Ended(String),
 }
 

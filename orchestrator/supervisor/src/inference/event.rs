@@ -4,9 +4,7 @@ use std::time::Duration;
 
 use gleaner_protocol::inference::InferenceReport;
 
-/// An event of the process, for the user.
 pub enum InferenceEvent {
-    /// One of its reports.
     Report(InferenceReport),
     /// A piece of its standard error.
     Stderr(Vec<u8>),

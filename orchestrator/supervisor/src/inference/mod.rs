@@ -25,12 +25,10 @@ pub use service::InferenceService;
 /// Program and name of the process.
 const INFERENCE: &str = "gleaner-inference";
 
-/// The purpose of a process.
 #[derive(Debug, Clone, Copy)]
 pub enum InferenceUse<'a> {
     /// The models of several lambdas, live: none may harm another one.
     Shared,
-    /// The models of one lambda.
     OneLambda,
     /// It builds engines into this folder.
     Engines(&'a std::path::Path),

@@ -20,7 +20,6 @@ pub(super) struct Process {
     #[expect(dead_code, reason = "it is only kept open")]
     pub(super) handover: UnixStream,
     pub(super) readers: Vec<JoinHandle<()>>,
-    /// Number of reports so far.
     pub(super) reports: Arc<AtomicU64>,
 }
 

@@ -175,7 +175,6 @@ impl InferenceService {
         Ok(lambda_end)
     }
 
-    /// Ends the process.
     pub fn stop(mut self) {
         self.end();
     }

@@ -12,7 +12,6 @@ use gleaner_lambda::manifest::Sha256;
 
 /// Name of the attachment with the signature.
 pub const SIGNATURE: &str = "gleaner/signature.json";
-/// Media type of that attachment.
 pub const MEDIA_TYPE: &str = "application/json";
 
 pub(super) const ATTACHMENT: u8 = 0x09;
@@ -63,12 +62,10 @@ pub struct ClipSigner {
 }
 
 impl ClipSigner {
-    /// Creates the signer of a vehicle.
     pub fn new(key: SecretKey, vehicle: VehicleName) -> Self {
         Self { key, vehicle }
     }
 
-    /// Returns the name of the vehicle.
     pub fn vehicle(&self) -> &VehicleName {
         &self.vehicle
     }

@@ -17,7 +17,6 @@ const MODELS_MAX: usize = gleaner_lambda::manifest::bounds::ITEMS_MAX;
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ClipStatement {
-    /// The vehicle that recorded it.
     #[serde(deserialize_with = "bounded::text")]
     pub vehicle: VehicleName,
     /// Name of the clip on the vehicle.
@@ -35,7 +34,6 @@ pub struct ClipStatement {
     pub from_ns: i64,
     /// End of the requested time, inclusive.
     pub to_ns: i64,
-    /// Number of its messages.
     pub messages: u64,
     /// Number of its triggers and commands.
     pub triggers: u64,
@@ -45,23 +43,18 @@ pub struct ClipStatement {
     /// The journals in it, by the names of their attachments.
     #[serde(deserialize_with = "bounded::list::<_, _, LAMBDAS_MAX>")]
     pub journals: Vec<SignedFile>,
-    /// The data that it lacks.
     pub losses: ClipLosses,
     /// True if its recorder died, and a later one recovered what was on the disk.
     pub recovered: bool,
 }
 
-/// A lambda of a clip.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SignedLambda {
-    /// Name of the lambda.
     #[serde(deserialize_with = "bounded::text")]
     pub name: LambdaName,
-    /// Version in its manifest.
     #[serde(deserialize_with = "bounded::text")]
     pub version: Version,
-    /// Kind of the lambda.
     pub kind: LambdaKind,
     /// SHA-256 over the files of its build, as `clips.jsonl` has it.
     #[serde(deserialize_with = "bounded::text")]
@@ -71,18 +64,14 @@ pub struct SignedLambda {
     /// SHA-256 of the text `config` in its metadata record.
     #[serde(deserialize_with = "bounded::text_or_null")]
     pub config: Option<Sha256>,
-    /// Its models.
     #[serde(deserialize_with = "bounded::list::<_, _, MODELS_MAX>")]
     pub models: Vec<SignedFile>,
 }
 
-/// A file with its digest.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SignedFile {
-    /// Name of the file.
     pub name: String,
-    /// Digest of its content.
     #[serde(deserialize_with = "bounded::text")]
     pub sha256: Sha256,
 }

@@ -106,7 +106,6 @@ impl TrustedVehicles {
 
 /// The reason why a list of vehicles cannot be used.
 #[derive(Debug, thiserror::Error)]
-#[allow(missing_docs)]
 pub enum VehiclesError {
     #[error("cannot read the list of vehicles `{}`", path.display())]
     Read { path: PathBuf, source: io::Error },

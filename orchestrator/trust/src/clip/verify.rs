@@ -18,7 +18,6 @@ const PIECE: usize = 256 << 10;
 /// A clip whose signature is that of a trusted vehicle, over exactly these bytes.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct SignedClip {
-    /// The signed data.
     pub statement: ClipStatement,
     /// Id of the key that signed it.
     pub key: Sha256,
@@ -58,7 +57,6 @@ struct SignatureAttachment {
     wrong_checksum: Option<&'static str>,
 }
 
-/// Reads a clip from its start to its end.
 struct ClipReader<R> {
     clip: R,
     content: ContentDigest,
@@ -191,7 +189,6 @@ impl<R: Read> ClipReader<R> {
 
 /// The reason why a clip is not accepted as that of a trusted vehicle.
 #[derive(Debug, thiserror::Error)]
-#[allow(missing_docs)]
 pub enum ClipRefusal {
     #[error("it cannot be read")]
     Read { source: io::Error },

@@ -80,7 +80,6 @@ impl Wrong {
     }
 }
 
-/// Loads a model with a signature.
 fn load_as(model: &[u8], signature: ModelSignature) -> Result<Box<dyn LoadedGraph>, BackendError> {
     let provider = ExecutionProvider::Cpu;
     let options = LoadOptions { provider, threads: 1, signature: &signature, engine: None };

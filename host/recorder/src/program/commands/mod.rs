@@ -214,7 +214,6 @@ impl Commands {
     }
 }
 
-/// Formats an error with its cause for a log.
 fn describe(error: &CommandError) -> String {
     let cause =
         std::error::Error::source(error).map(|cause| format!(": {cause}")).unwrap_or_default();

@@ -16,9 +16,7 @@ pub struct Budget {
 }
 
 impl Budget {
-    /// No limit.
     pub const ALL: Budget = Budget { bytes: usize::MAX, entries: usize::MAX };
-    /// No work.
     pub const NONE: Budget = Budget { bytes: 0, entries: 0 };
     /// 0.1 to 0.2 ms, unless a single message takes longer.
     pub const STEP: Budget = Budget { bytes: 256 << 10, entries: 1024 };

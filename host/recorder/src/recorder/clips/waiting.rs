@@ -60,7 +60,6 @@ impl WaitingTriggers {
         };
     }
 
-    /// The trigger of `lambda` at `at_ns`, if it waits.
     pub fn find(&self, lambda: usize, at_ns: i64) -> Option<&Moment> {
         self.moments
             .iter()

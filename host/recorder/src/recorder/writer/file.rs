@@ -32,7 +32,6 @@ pub struct ClipFile {
     images: Option<usize>,
     /// The thumbnail, once an image was decoded.
     jpeg: Option<Vec<u8>>,
-    /// Number of images that were tried.
     tried: u32,
 }
 

@@ -27,7 +27,6 @@ const IN_FLIGHT: usize = 16 << 20;
 
 #[derive(Copy, Clone, Debug)]
 pub struct ClipSample<'a> {
-    /// Number of its topic.
     pub topic: usize,
     pub schema: &'a Arc<TopicSchema>,
     pub meta: &'a SampleMeta,

@@ -136,7 +136,6 @@ impl ClipTracker {
         self.sent += bytes;
     }
 
-    /// Notes that a piece has arrived.
     pub(super) fn arrived(&mut self, piece: u64) {
         self.piece = (piece * 2).min(CLIP_PART);
     }

@@ -174,7 +174,6 @@ impl Spools {
         sent.await.unwrap();
     }
 
-    /// Returns whether a cloud has everything.
     fn are_in(&self, cloud: &StoredRecords) -> bool {
         let has = |stream: &&str| {
             let cursor = cloud.cursors.get(*stream);

@@ -17,7 +17,7 @@ impl Lambda for Keeper {
     fn on_tick(&mut self, _tick: Tick) -> Result<()> {
         let before = match scratch::get("wakes", 0, 8) {
             Ok(bytes) => bytes.try_into().map(u64::from_le_bytes).unwrap_or_default(),
-            Err(error) if error.kind() == Some("no-such-entry") => 0,
+            Err(error) if error.is(scratch::ScratchErrorKind::NoSuchEntry) => 0,
             Err(error) => return Err(error),
         };
         let wakes = before + 1;

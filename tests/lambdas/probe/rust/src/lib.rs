@@ -2,6 +2,7 @@
 
 use gleaner_sdk::data::{Roi, Value, encoding_name};
 use gleaner_sdk::inference::{ElementType, Model, Placement, Preprocess, Tensor, element_name};
+use gleaner_sdk::trigger::AttributeValue;
 use gleaner_sdk::{
     Config, Error, Field, Lambda, Result, Sample, Topic, event, input, inputs, log, now_ns, start,
     stop,
@@ -195,8 +196,9 @@ impl Probe {
 }
 
 /// The kind of the refusal; `none` for a result.
-fn kind<T>(answer: Result<T>) -> &'static str {
-    answer.err().and_then(|error| error.kind()).unwrap_or("none")
+fn kind<T>(answer: Result<T>) -> AttributeValue {
+    let kind = answer.err().and_then(|error| error.kind());
+    kind.map_or("none".into(), |kind| kind.to_string().as_str().into())
 }
 
 fn fnv1a(bytes: &[u8]) -> i64 {

@@ -41,7 +41,6 @@ pub struct Settled {
     pub newest: i64,
 }
 
-/// A clip that is being written.
 pub struct OpenClip {
     /// The number of its group of windows. Entries in one of the group's clips are marked with it.
     group: u64,
@@ -62,7 +61,6 @@ pub struct OpenClip {
     /// The trigger that names it.
     opening: Moment,
     from: i64,
-    /// True if its file is begun.
     is_begun: bool,
     messages: u64,
     tallies: Vec<TopicTally>,
@@ -114,7 +112,6 @@ impl OpenClip {
         }
     }
 
-    /// The number of its group of windows.
     pub fn group(&self) -> u64 {
         self.group
     }

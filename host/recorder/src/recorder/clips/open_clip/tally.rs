@@ -16,7 +16,6 @@ pub struct TopicTally {
     huge: u64,
     /// True if a window reaches further back than the preroll.
     pub is_aged: bool,
-    /// Latched samples that were not kept.
     pub latched_dropped: u64,
 }
 

@@ -1,4 +1,4 @@
-"""Requests to the cloud of a fleet, for ``gleaner.cloud``, which has the public names.
+"""Requests to the cloud of a fleet.
 
 What comes from the cloud is bounded and checked: names lead out of no folder, lists and answers
 end, and a file counts only with the digest that its vehicle has announced.
@@ -15,7 +15,7 @@ import re
 import stat
 import time
 from pathlib import Path
-from typing import Any, BinaryIO, Dict, Iterator, List, Mapping, Optional, Tuple, Union
+from typing import Any, BinaryIO, Dict, Iterator, List, Literal, Mapping, Optional, Tuple, Union
 from urllib.parse import quote, urlencode, urlsplit
 
 ANSWER_MAX = 64 << 20
@@ -33,6 +33,9 @@ PART = 500
 PIECE = 1 << 20
 
 NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,255}")
+
+ClipState = Literal["on-vehicle", "wanted", "uploading", "stored", "gone", "failed"]
+"""The place of a clip's file, as the cloud's description of its API lists them."""
 
 
 class CloudError(Exception):
@@ -113,11 +116,8 @@ class Cloud:
         vehicle, as in ``site=berlin``, ``function`` the id of a deployment, and ``level`` the
         least of a log line. Without a bound, read as many as you need, and stop.
         """
-        values = {"text": text or None, "vehicle": vehicle, "label": label, "lambda": function}
-        values.update(kind=kind, level=level)
-        values.update(from_ns=None if from_ns is None else str(from_ns))
-        values.update(to_ns=None if to_ns is None else str(to_ns))
-        query = {key: value for key, value in values.items() if value is not None}
+        first = _query(text=text or None, vehicle=vehicle, label=label, function=function)
+        query = {**first, **_query(kind=kind, level=level, from_ns=from_ns, to_ns=to_ns)}
         while True:
             path = f"/v1/records?{urlencode(query)}"
             part = self._json("GET", path)
@@ -144,10 +144,8 @@ class Cloud:
 
         ``function`` is the name of a lambda; times are in ns since 1970.
         """
-        values = {"vehicle": vehicle, "lambda": function, "label": label}
-        values.update(from_ns=None if from_ns is None else str(from_ns))
-        values.update(to_ns=None if to_ns is None else str(to_ns))
-        query = {key: value for key, value in values.items() if value is not None}
+        chosen = {"vehicle": vehicle, "function": function, "label": label}
+        query = _query(**chosen, from_ns=from_ns, to_ns=to_ns)
         return [Clip(self, facts) for facts in self._list("/v1/clips", query, most)]
 
     def clip(self, id: str) -> Clip:
@@ -183,9 +181,7 @@ class Cloud:
         return entries[:wanted]
 
     def _lines(self, path: str, last: Optional[int], follow: bool) -> Iterator[Dict[str, Any]]:
-        values = {"follow": "true" if follow else "false"}
-        if last is not None:
-            values["last"] = str(last)
+        values = _query(follow="true" if follow else "false", last=last)
         answer, close = self._open("GET", f"{path}?{urlencode(values)}", {})
         try:
             while True:
@@ -255,10 +251,10 @@ class Clip:
         return f"{self._name}@{self._vehicle}"
 
     @property
-    def state(self) -> str:
-        """The place of its file: ``on-vehicle``, ``wanted``, ``uploading``, ``stored``, ``gone``
-        or ``failed``."""
-        return str(self.facts["state"])
+    def state(self) -> ClipState:
+        """The place of its file. A newer cloud may have further ones."""
+        state: ClipState = self.facts["state"]
+        return state
 
     def refresh(self) -> None:
         """Gets its facts again."""
@@ -331,6 +327,12 @@ class Clip:
     @property
     def _path(self) -> str:
         return f"/v1/clips/{_part(self.id)}"
+
+
+def _query(**values: Union[str, int, None]) -> Dict[str, str]:
+    """The values that are set. ``lambda`` is a keyword of Python, so it is ``function`` here."""
+    given = {key: str(value) for key, value in values.items() if value is not None}
+    return {"lambda" if key == "function" else key: value for key, value in given.items()}
 
 
 def _part(name: str) -> str:

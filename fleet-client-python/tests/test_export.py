@@ -9,7 +9,7 @@ import unittest
 from pathlib import Path
 from typing import Any, Dict
 
-from gleaner import cloud
+from gleaner_fleet import export
 
 
 def event(clip: str, at_ns: int) -> Dict[str, Any]:
@@ -34,10 +34,10 @@ class Export(unittest.TestCase):
 
     def write(self, *rows: Dict[str, Any]) -> None:
         text = "".join(json.dumps(row) + "\n" for row in rows)
-        (self.folder / cloud.TABLE).write_text(text, encoding="utf-8")
+        (self.folder / export.TABLE).write_text(text, encoding="utf-8")
 
     def package(self, name: str) -> Any:
-        """The package, which a lambda does not need; skips the test without it."""
+        """The package, which is optional; skips the test without it."""
         try:
             return importlib.import_module(name)
         except ImportError:
@@ -45,23 +45,23 @@ class Export(unittest.TestCase):
 
     def test_each_row_has_every_column(self) -> None:
         self.write(event("car-7/a.mcap", 1), event("car-7/b.mcap", 2))
-        rows = cloud.events(self.folder)
+        rows = export.events(self.folder)
         self.assertEqual([row["at_ns"] for row in rows], [1, 2])
-        self.assertEqual(set(rows[0]), set(cloud.COLUMNS))
+        self.assertEqual(set(rows[0]), set(export.COLUMNS))
         self.assertIsNone(rows[0]["revision"])
 
     def test_a_clip_outside_of_the_folder_is_refused(self) -> None:
         for clip in ("../secret", "/etc/passwd"):
             self.write(event(clip, 1))
             with self.assertRaises(ValueError):
-                cloud.events(self.folder)
+                export.events(self.folder)
 
     def test_pandas_reads_the_table(self) -> None:
         pandas = self.package("pandas")
         self.package("pyarrow")
         self.write(event("car-7/a.mcap", 1), event("car-7/b.mcap", 2))
-        table = pandas.read_parquet(cloud.write_parquet(self.folder))
-        self.assertEqual(list(table.columns), list(cloud.COLUMNS))
+        table = pandas.read_parquet(export.write_parquet(self.folder))
+        self.assertEqual(list(table.columns), list(export.COLUMNS))
         self.assertEqual(list(table["label"]), ["dark", "dark"])
         self.assertEqual(json.loads(table["attributes"][0]), {"lat": 59.9})
         self.assertEqual(list(table["at_ns"]), [1, 2])
@@ -79,9 +79,5 @@ class Export(unittest.TestCase):
                 time = second * 10**9
                 writer.add_message(channel, time, bytes([second]), time)
             writer.finish()
-        near = cloud.messages(self.folder, event("car-7/a.mcap", 5 * 10**9))
+        near = export.messages(self.folder, event("car-7/a.mcap", 5 * 10**9))
         self.assertEqual([data[0] for _, _, data in near], [4, 5, 6])
-
-
-if __name__ == "__main__":
-    unittest.main()

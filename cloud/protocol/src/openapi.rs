@@ -1,27 +1,20 @@
-//! The description of the API for other programs: OpenAPI 3.1, from the table of requests and the
-//! types of their messages.
+//! The description of an API for other programs: OpenAPI 3.1, from the table of its requests and
+//! the types of their messages.
 
-use std::sync::LazyLock;
+mod endpoint;
 
-use axum::http::header;
-use axum::response::{IntoResponse, Response};
 use gleaner_protocol::vehicle_api::Problem;
 use schemars::SchemaGenerator;
 use schemars::generate::SchemaSettings;
 use serde_json::{Map, Value, json};
 
-use super::endpoint::{Endpoint, MessageShape};
-use super::endpoints;
+pub use endpoint::{Endpoint, MessageShape};
 
 /// Path of the schemas of types in the document.
 const SCHEMAS: &str = "/components/schemas";
 
-pub(super) async fn document() -> Response {
-    static DOCUMENT: LazyLock<String> = LazyLock::new(|| describe(&endpoints()).to_string());
-    ([(header::CONTENT_TYPE, "application/json")], DOCUMENT.as_str()).into_response()
-}
-
-fn describe(endpoints: &[Endpoint]) -> Value {
+/// Returns the description of an API, with all keys sorted.
+pub fn describe<S>(title: &str, description: &str, endpoints: &[Endpoint<S>]) -> String {
     let settings = SchemaSettings::draft2020_12().with(|settings| {
         settings.definitions_path = SCHEMAS.into();
         settings.meta_schema = None;
@@ -35,23 +28,28 @@ fn describe(endpoints: &[Endpoint]) -> Value {
     }
     let problem = generator.subschema_for::<Problem>();
     let problem = json!({ "application/problem+json": { "schema": problem } });
-    json!({
+    let mut document = json!({
         "openapi": "3.1.0",
         "info": {
-            "title": "Gleaner cloud",
+            "title": title,
             "version": env!("CARGO_PKG_VERSION"),
-            "description": "The API for people of the cloud of a fleet.",
+            "description": description,
         },
         "paths": paths,
         "components": {
             "schemas": generator.take_definitions(true),
             "responses": { "Problem": { "description": "An error", "content": problem } },
-            "securitySchemes": { "token": { "type": "http", "scheme": "bearer" } },
         },
-    })
+    });
+    if endpoints.iter().any(|it| it.role.is_some()) {
+        document["components"]["securitySchemes"] =
+            json!({ "token": { "type": "http", "scheme": "bearer" } });
+    }
+    document.sort_all_objects();
+    format!("{document:#}\n")
 }
 
-fn operation(endpoint: &Endpoint, generator: &mut SchemaGenerator) -> Value {
+fn operation<S>(endpoint: &Endpoint<S>, generator: &mut SchemaGenerator) -> Value {
     let Endpoint { method, path, role, needs_login, summary, query, headers, takes, gives, .. } =
         endpoint;
     let names = path.split(['{', '}']).skip(1).step_by(2);
@@ -62,13 +60,14 @@ fn operation(endpoint: &Endpoint, generator: &mut SchemaGenerator) -> Value {
         })
         .collect();
     let schema = query.map(|query| query(generator).to_value());
-    let values = schema.as_ref().and_then(|it| it["properties"].as_object());
-    parameters.extend(
-        values
-            .into_iter()
-            .flatten()
-            .map(|(name, schema)| json!({ "name": name, "in": "query", "schema": schema })),
-    );
+    let query = schema.unwrap_or_default();
+    let needed = query["required"].as_array().map_or(&[][..], Vec::as_slice);
+    parameters.extend(query["properties"].as_object().into_iter().flatten().map(
+        |(name, schema)| {
+            let required = needed.iter().any(|it| it == name);
+            json!({ "name": name, "in": "query", "required": required, "schema": schema })
+        },
+    ));
     parameters.extend(
         headers
             .iter()

@@ -1,10 +1,7 @@
-"""The cloud of a fleet, for notebooks, and exports of clips.
-
-``Cloud`` lists vehicles, deployments, events and clips, and fetches clips. The functions read an
-export: the folder that ``gleaner clips export --to DIR`` writes.
+"""Reads an export of clips: the folder that ``gleaner clips export --to DIR`` writes.
 
 ``events`` needs nothing but Python. ``messages`` needs the package ``mcap``, and ``write_parquet``
-``pyarrow``; ``python -m gleaner.cloud DIR`` calls the latter.
+``pyarrow``; ``python -m gleaner_fleet.export DIR`` calls the latter.
 """
 
 from __future__ import annotations
@@ -14,10 +11,6 @@ import json
 import sys
 from pathlib import Path
 from typing import Any, Dict, Iterable, Iterator, List, Optional, Tuple, Union
-
-from ._cloud import Clip as Clip
-from ._cloud import Cloud as Cloud
-from ._cloud import CloudError as CloudError
 
 TABLE = "events.jsonl"
 """Name of the table in an export, with one object of JSON in each line."""

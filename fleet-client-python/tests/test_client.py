@@ -13,13 +13,12 @@ import threading
 import unittest
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any, Dict, List, Optional, Tuple
+from typing import Any, Dict, List, Optional, Tuple, get_args
 from unittest import mock
 
-from home import CHECKOUT
+from gleaner_fleet import Clip, ClipState, Cloud, CloudError
 
-from gleaner.cloud import Clip, Cloud, CloudError
-
+CHECKOUT = Path(__file__).resolve().parents[2]
 CONTENT = b"0123456789" * 100
 DIGEST = hashlib.sha256(CONTENT).hexdigest()
 
@@ -221,6 +220,10 @@ class RealCloud(unittest.TestCase):
             connection.request("POST", path, json.dumps(body), headers)
             return json.load(connection.getresponse())
 
+        connection.request("GET", "/v1/openapi.json")
+        schemas = json.load(connection.getresponse())["components"]["schemas"]
+        states = schemas["ClipState"]["oneOf"]
+        self.assertEqual(tuple(state["const"] for state in states), get_args(ClipState))
         token = post("/v1/login", {"code": code}, "")["token"]
         cloud = Cloud(url, token)
         self.assertEqual((cloud.vehicles(), cloud.deployments(), cloud.clips()), ([], [], []))
@@ -231,7 +234,3 @@ class RealCloud(unittest.TestCase):
         with self.assertRaisesRegex(CloudError, "there is no clip"):
             cloud.clip("a@car-7")
         self.assertEqual(list(cloud.events("car-7", last=1)), [])
-
-
-if __name__ == "__main__":
-    unittest.main()

@@ -1,23 +1,22 @@
-//! A request that the API answers, with all that its description has.
-
-use std::sync::Arc;
+//! A request that an API answers, with all that its description has.
 
 use axum::http::Method;
 use axum::routing::MethodRouter;
-use gleaner_fleet::people::Role;
 use schemars::{JsonSchema, Schema, SchemaGenerator};
 
-use crate::cloud::Cloud;
-use crate::transfer::OCTETS;
+use crate::people::Role;
 
-pub(crate) struct Endpoint {
+/// A request that an API answers. Its router and its description have the same list of them.
+#[derive(Debug)]
+pub struct Endpoint<S> {
     /// Its method, which the handler has, too.
-    pub(crate) method: Method,
-    pub(crate) path: &'static str,
+    pub method: Method,
+    /// Its path, with names in braces.
+    pub path: &'static str,
     /// The least role; `None` if no token is needed.
-    pub(crate) role: Option<Role>,
+    pub role: Option<Role>,
     /// True if tokens for programs are refused.
-    pub(crate) needs_login: bool,
+    pub needs_login: bool,
     pub(super) summary: &'static str,
     /// The type of its values after `?`.
     pub(super) query: Option<fn(&mut SchemaGenerator) -> Schema>,
@@ -25,14 +24,16 @@ pub(crate) struct Endpoint {
     pub(super) headers: &'static [&'static str],
     pub(super) takes: Option<MessageShape>,
     /// The answer; `None` if it has no content.
-    pub(super) gives: Option<MessageShape>,
-    pub(super) handler: MethodRouter<Arc<Cloud>>,
+    pub gives: Option<MessageShape>,
+    /// The handler of its requests.
+    pub handler: MethodRouter<S>,
 }
 
 /// The type of the content of a message, with its schema if it is JSON.
-#[derive(Clone, Copy)]
-pub(super) struct MessageShape {
-    pub(super) kind: &'static str,
+#[derive(Debug, Clone, Copy)]
+pub struct MessageShape {
+    /// The media type.
+    pub kind: &'static str,
     pub(super) schema: Option<fn(&mut SchemaGenerator) -> Schema>,
 }
 
@@ -42,15 +43,15 @@ impl MessageShape {
     }
 }
 
-impl Endpoint {
+impl<S> Endpoint<S> {
     /// Creates a request. Changes by an admin give and take access: they need a login, so that
     /// nothing which a stolen token for programs makes outlives the token.
-    pub(super) fn new(
+    pub fn new(
         method: Method,
         path: &'static str,
         role: Option<Role>,
         summary: &'static str,
-        handler: MethodRouter<Arc<Cloud>>,
+        handler: MethodRouter<S>,
     ) -> Self {
         let (query, takes, gives, headers): (_, _, _, &[_]) = (None, None, None, &[]);
         let needs_login = role == Some(Role::Admin) && method != Method::GET;
@@ -58,42 +59,45 @@ impl Endpoint {
     }
 
     /// States that it needs a login.
-    pub(super) fn needs_login(self) -> Self {
+    pub fn needs_login(self) -> Self {
         Self { needs_login: true, ..self }
     }
 
     /// States the type of the values after `?`.
-    pub(super) fn query<T: JsonSchema>(self) -> Self {
+    pub fn query<T: JsonSchema>(self) -> Self {
         Self { query: Some(T::json_schema), ..self }
     }
 
     /// States headers that it has a use for.
-    pub(super) fn headers(self, headers: &'static [&'static str]) -> Self {
+    pub fn headers(self, headers: &'static [&'static str]) -> Self {
         Self { headers, ..self }
     }
 
     /// States the type of the body.
-    pub(super) fn takes<T: JsonSchema>(self) -> Self {
+    pub fn takes<T: JsonSchema>(self) -> Self {
         Self { takes: MessageShape::of::<T>("application/json"), ..self }
     }
 
     /// States that the body is a file.
-    pub(super) fn takes_file(self) -> Self {
-        Self { takes: Some(MessageShape { kind: OCTETS, schema: None }), ..self }
+    pub fn takes_file(self) -> Self {
+        Self {
+            takes: Some(MessageShape { kind: "application/octet-stream", schema: None }),
+            ..self
+        }
     }
 
     /// States the type of the answer.
-    pub(super) fn gives<T: JsonSchema>(self) -> Self {
+    pub fn gives<T: JsonSchema>(self) -> Self {
         Self { gives: MessageShape::of::<T>("application/json"), ..self }
     }
 
     /// States the type of each line of the answer.
-    pub(super) fn gives_lines<T: JsonSchema>(self) -> Self {
+    pub fn gives_lines<T: JsonSchema>(self) -> Self {
         Self { gives: MessageShape::of::<T>("application/x-ndjson"), ..self }
     }
 
     /// States that the answer is a file of this kind.
-    pub(super) fn gives_file(self, kind: &'static str) -> Self {
+    pub fn gives_file(self, kind: &'static str) -> Self {
         Self { gives: Some(MessageShape { kind, schema: None }), ..self }
     }
 }
