@@ -131,7 +131,7 @@ pub fn write_atomically_by<S: WriteSteps>(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::test_folder::TestFolder;
+    use gleaner_test_support::TestFolder;
 
     #[test]
     fn a_file_is_replaced_and_a_link_at_the_temporary_path_is_not_followed() {

@@ -12,7 +12,7 @@ pub enum Exit {
     Usage = 2,
     /// 3: denied by a grant, a signature or a permission.
     Denied = 3,
-    /// 4: the wanted state was not reached in time, or two results that should be equal differ.
+    /// 4: the desired state was not reached in time, or two results that should be equal differ.
     Differs = 4,
     /// 5: a vehicle, the cloud or another program cannot be reached.
     Unreachable = 5,

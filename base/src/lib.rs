@@ -10,11 +10,10 @@ mod failure;
 mod line_pieces;
 mod open_files;
 mod plain_file;
+pub mod programs;
 mod rate_limit;
 pub mod safe_file;
 mod shortage;
-#[cfg(test)]
-mod test_folder;
 pub mod text;
 mod time;
 pub mod units;

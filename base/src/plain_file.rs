@@ -210,7 +210,7 @@ mod tests {
     use rustix::fs::{CWD, FileType, Mode, mknodat};
 
     use super::*;
-    use crate::test_folder::TestFolder;
+    use gleaner_test_support::TestFolder;
 
     const MOST: ByteSize = ByteSize::new(10);
 

@@ -172,7 +172,7 @@ mod tests {
     use rustix::fs::{CWD, FileType, Mode, mknodat};
 
     use super::*;
-    use crate::test_folder::TestFolder;
+    use gleaner_test_support::TestFolder;
 
     /// All functions that open an existing file.
     const OPEN: [fn(&Path) -> io::Result<File>; 4] = [append, write, edit, read];

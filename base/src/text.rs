@@ -45,7 +45,7 @@ pub fn excerpt(text: &str) -> String {
 }
 
 /// Formats a failed action and its causes in one line, safe to print.
-pub fn in_words(action: &str, causes: &[String]) -> String {
+pub fn describe(action: &str, causes: &[String]) -> String {
     let parts = std::iter::once(action).chain(causes.iter().map(String::as_str));
     parts.map(visible).collect::<Vec<_>>().join(": ")
 }

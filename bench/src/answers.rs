@@ -4,8 +4,8 @@
 use std::sync::{Arc, Mutex, PoisonError};
 
 use gleaner_dds::Dds;
+use gleaner_messages::transport::{Delivery, Qos, SampleMeta, Sink, TopicSpec, Transport};
 use gleaner_messages::{Definitions, FieldPath, Sources};
-use gleaner_transport::{Delivery, Qos, SampleMeta, Sink, TopicSpec, Transport};
 
 const TYPE: &str = "sensor_msgs/msg/TimeReference";
 

@@ -121,7 +121,7 @@ impl CloudAccount {
             return Ok(Self { url: url.clone(), token: token.clone() });
         }
         let stored = Self::stored()?.ok_or_else(|| {
-            Failure::new(Exit::Denied, "there is no token for a cloud").with_help(LOGIN_HELP)
+            Failure::new(Exit::Denied, "not logged in to a cloud").with_help(LOGIN_HELP)
         })?;
         match url {
             // The token must not reach another cloud.

@@ -4,8 +4,8 @@ use std::ffi::OsString;
 use std::os::unix::process::CommandExt;
 use std::process::Command;
 
+use gleaner_base::programs::InstalledPrograms;
 use gleaner_base::{Exit, Failure};
-use gleaner_parts::Parts;
 use gleaner_protocol::Report;
 use gleaner_protocol::ingress::IngressReport;
 use serde::de::DeserializeOwned;
@@ -17,7 +17,7 @@ use crate::separate;
 
 /// Replaces this process by the program `name`, such as `gleaner-player`.
 pub(crate) fn replace(name: &str, arguments: &[OsString]) -> Result<Exit, Failure> {
-    let program = Parts::find()?.program(name).map_err(|error| {
+    let program = InstalledPrograms::find()?.program(name).map_err(|error| {
         let mut failure = Failure::from(error);
         let package = if name == "gleaner-cloud" { name } else { "gleaner" };
         let others = failure.help.iter().map(|help| format!("; {help}")).collect::<String>();
@@ -67,7 +67,7 @@ pub(crate) fn inspect(args: &InspectArgs) -> Result<Exit, Failure> {
 
 /// Runs a program with these arguments; returns its report, or its exit code if it failed.
 fn report<T: DeserializeOwned>(name: &str, line: &[OsString]) -> Result<Result<T, Exit>, Failure> {
-    let program = Parts::find()?.program(name)?;
+    let program = InstalledPrograms::find()?.program(name)?;
     let failed =
         |what: &str, error: &dyn std::error::Error| Failure::caused_by(Exit::Internal, what, error);
     let mut command = Command::new(&program);

@@ -10,10 +10,10 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::time::{Duration, Instant};
 
 use gleaner_artifacts::{BuiltEngine, DerivedEntry, DerivedKind, make_store};
+use gleaner_base::programs::{InstalledPrograms, cache_dir};
 use gleaner_base::{ByteSize, Exit, Failure, PlainFile, chain, visible};
 use gleaner_lambda::manifest::{Manifest, ModelSpec};
 use gleaner_lambda::{BuildDir, InferenceLimits};
-use gleaner_parts::{Parts, cache_dir};
 use gleaner_protocol::inference::{
     InferenceReport, ModelCall, ModelClient, ModelState, engine_file,
 };
@@ -55,7 +55,7 @@ struct EngineBuilt {
 
 /// Builds the engines of the models of the lambda in the folder `lambda`, and prints the result.
 pub(crate) fn build(lambda: &Path, is_json: bool) -> Result<Exit, Failure> {
-    let (parts, build) = (Parts::find()?, BuildDir::check_fresh(lambda)?);
+    let (parts, build) = (InstalledPrograms::find()?, BuildDir::check_fresh(lambda)?);
     let manifest = Manifest::load(build.path())?;
     let store = cache_dir()?;
     make_store(&store)?;
@@ -110,7 +110,7 @@ impl EngineResult {
 }
 
 struct EngineBuild<'a> {
-    parts: &'a Parts,
+    parts: &'a InstalledPrograms,
     build: &'a BuildDir,
     manifest: &'a Manifest,
     model: &'a ModelSpec,

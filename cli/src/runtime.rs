@@ -10,10 +10,10 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use gleaner_base::programs::InstalledPrograms;
 use gleaner_base::{Exit, Explain, Failure, visible};
 use gleaner_lambda::manifest::{LambdaKind, Manifest};
 use gleaner_lambda::{BuildDir, InferenceLimits, Vehicle};
-use gleaner_parts::Parts;
 use gleaner_protocol::{CheckReport, Handover, PASSES_INFERENCE, ReplaySummary, Report, Verified};
 use gleaner_supervisor::lines::{next_report, pass_on};
 use gleaner_supervisor::{InferenceEvent, InferenceService, InferenceUse, starter};
@@ -77,7 +77,7 @@ pub(crate) fn run(
     vehicle: Option<&Path>,
     arguments: Vec<OsString>,
 ) -> Result<(Option<RuntimeResult>, Exit), Failure> {
-    let parts = Parts::find()?;
+    let parts = InstalledPrograms::find()?;
     let runtime = parts.program("gleaner-runtime")?;
     // The runtime reports that it cannot be read.
     let build = BuildDir::of(lambda);
@@ -141,7 +141,7 @@ struct ModelsOfRun {
 
 impl ModelsOfRun {
     fn start(
-        parts: &Parts,
+        parts: &InstalledPrograms,
         build: &BuildDir,
         manifest: &Manifest,
         limits: &InferenceLimits,

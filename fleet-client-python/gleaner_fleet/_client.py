@@ -230,7 +230,7 @@ class Clip:
         self._cloud, self.facts = cloud, facts
         name, _, vehicle = str(facts.get("id")).rpartition("@")
         if not NAME.fullmatch(name) or not NAME.fullmatch(vehicle):
-            raise _bad(f"{facts.get('id')!r} is no id of a clip")
+            raise _bad(f"{facts.get('id')!r} is not a clip id")
         types = {"state": str, "bytes": int}
         if not all(isinstance(facts.get(key), kind) for key, kind in types.items()):
             raise _bad(f"clip {name}@{vehicle} has no state or no length")
@@ -396,7 +396,7 @@ def _account(url: Optional[str], token: Optional[str]) -> Tuple[str, str]:
         mode = path.stat().st_mode
         account = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        reason = "there is no token for a cloud: `gleaner login URL --code CODE`"
+        reason = "not logged in to a cloud: `gleaner login URL --code CODE`"
         raise ValueError(reason) from None
     if stat.S_IMODE(mode) & 0o077:
         raise ValueError(f"other users can read the token in {path}: `chmod 600 {path}`")

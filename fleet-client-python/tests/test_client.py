@@ -195,7 +195,7 @@ class RealCloud(unittest.TestCase):
         if not path.is_file():
             self.skipTest(f"{path} is not built")
         with tempfile.TemporaryDirectory() as folder:
-            any_port = ["--people", "127.0.0.1:0", "--vehicles", "127.0.0.1:0"]
+            any_port = ["--http", "127.0.0.1:0", "--vehicles", "127.0.0.1:0"]
             command = [str(path), "serve", "--data", f"{folder}/data", *any_port]
             with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
                 try:

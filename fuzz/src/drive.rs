@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
 
 use gleaner_drives::{DriveLimits, Replay, ReplayStep, read_extras};
-use gleaner_transport::{Delivery, SampleMeta, Sink, Subscription, TopicSpec, Transport};
+use gleaner_messages::transport::{Delivery, SampleMeta, Sink, Subscription, TopicSpec, Transport};
 use rustix::fs::{MemfdFlags, SeekFrom, ftruncate, memfd_create, seek};
 
 use crate::budget;

@@ -11,7 +11,6 @@ use gleaner_fleet::{Body, Enrolment, Frame, LINES_MAX, decompress, desired_diges
 use crate::budget;
 use crate::input::FuzzInput;
 
-/// Modes of an input.
 pub mod mode {
     /// A frame follows.
     pub const FRAME: u8 = 0;

@@ -3,7 +3,7 @@
 //! An input is a byte for the mode, and then either a JPEG or PNG file, or the fields of an image
 //! and its pixels.
 
-use gleaner_image::{
+use gleaner_pixels::{
     Encoding, ImageError, MAX_SIDE, PixelError, Roi, StopCheck, View, decode, ops, probe,
     probe_message,
 };
@@ -11,7 +11,6 @@ use gleaner_image::{
 use crate::budget;
 use crate::input::FuzzInput;
 
-/// Modes of an input.
 pub mod mode {
     /// A file follows.
     pub const FILE: u8 = 0;

@@ -1,6 +1,6 @@
 //! Fuzzes the sockets of the ingress and of programs that a starter starts: requests of a reader,
-//! which is a stranger, messages of the ingress to a reader, and requests and connections of a
-//! starter.
+//! which is an untrusted peer, messages of the ingress to a reader, and requests and connections of
+//! a starter.
 //!
 //! One socket comes with the first byte, from whichever side.
 //!
@@ -19,7 +19,6 @@ use crate::budget;
 use crate::input::FuzzInput;
 use crate::link::{MEMORY, sent};
 
-/// Bits of the mode.
 pub mod mode {
     /// Mask of the two bits that select sender and receiver.
     pub const PEERS: u8 = 3;

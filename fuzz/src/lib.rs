@@ -17,20 +17,11 @@ pub mod fleet;
 pub mod image;
 pub mod ingress;
 mod input;
-// The checks of `gleaner-inference` without the libraries that run models, which would take minutes
-// to build once more, instrumented.
-#[path = "../../host/inference/src/inspect/mod.rs"]
-pub mod inspect;
 pub mod journal;
 pub mod link;
 pub mod manifest;
 pub mod message;
 pub mod model;
-// The writer of the tests of `gleaner-inference`, for seeds.
-#[path = "../../host/inference/tests/suite/onnx.rs"]
-mod onnx;
-#[path = "../../host/inference/src/places.rs"]
-pub mod places;
 pub mod seeds;
 pub mod spool;
 pub mod trust;
@@ -63,7 +54,6 @@ macro_rules! target {
     };
 }
 
-/// All targets.
 pub const TARGETS: [Target; 13] = [
     target!(message, 4),
     target!(drive, 8),

@@ -22,7 +22,6 @@ use crate::budget;
 use crate::input::FuzzInput;
 use crate::journal;
 
-/// Bits of the mode.
 pub mod mode {
     /// Mask of the two bits that select sender and receiver.
     pub const PEERS: u8 = 3;

@@ -15,7 +15,6 @@ use gleaner_messages::{
 use crate::budget;
 use crate::input::FuzzInput;
 
-/// Modes of an input.
 pub mod mode {
     /// A bundled type follows.
     pub const BUNDLED: u8 = 0;

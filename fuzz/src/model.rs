@@ -3,23 +3,22 @@
 //!
 //! An input is a byte for the mode, and then a file, or the fields of the others.
 
+use gleaner_inference::inspect::{ModelSignature, inspect};
+use gleaner_inference::places::{PlacedInput, check_inputs};
+use gleaner_pixels::vision::{
+    Detection, DetectorLayout, MAX_DETECTIONS, OutputView, Placed, Placement, Preparer, Preprocess,
+    Wanted, detect,
+};
 use gleaner_protocol::inference::{
     Element, MAX_DIMENSIONS, MAX_TENSOR_BYTES, ModelCall, ModelReply, ModelRequest, ModelResult,
     TENSOR_ALIGNMENT, TensorInfo, TensorPlace,
 };
 use gleaner_rules::pixels::{Encoding, View};
-use gleaner_vision::{
-    Detection, DetectorLayout, MAX_DETECTIONS, OutputView, Placed, Placement, Preparer, Preprocess,
-    Wanted, detect,
-};
 
 use crate::budget;
 use crate::image::ENCODINGS;
 use crate::input::FuzzInput;
-use crate::inspect::{ModelSignature, inspect};
-use crate::places::{PlacedInput, check_inputs};
 
-/// Modes of an input.
 pub mod mode {
     /// A file follows.
     pub const FILE: u8 = 0;

@@ -3,12 +3,9 @@
 //! An input is a byte for the mode, then data that depends on the mode. Checksums would stop a
 //! fuzzer early, so one mode computes them.
 
-use std::io;
-
 use gleaner_protocol::SpooledRecord;
-use gleaner_spool::{
-    PAYLOAD_MAX, SegmentFile, SpoolError, SpoolItem, SpoolReader, SpoolRecord, SpoolStorage,
-};
+use gleaner_spool::{PAYLOAD_MAX, SpoolError, SpoolItem, SpoolReader, SpoolRecord};
+use gleaner_test_support::simulated_disk::SimulatedDisk;
 
 use crate::budget;
 use crate::input::FuzzInput;
@@ -38,9 +35,17 @@ pub fn check(data: &[u8]) -> bool {
         mode::RECORDS => sealed(input),
         _ => vec![(0, input.0.to_vec())],
     };
-    let (valid, records) = read(&segments, None);
-    assert_eq!((valid, records), read(&segments, None), "the same segments, read twice");
-    read(&segments, Some(3));
+    let bytes = segments.iter().map(|(_, bytes)| bytes.len()).sum();
+    let disk = SimulatedDisk::new(0);
+    for (first, bytes) in &segments {
+        drop(disk.add(*first));
+        disk.with_content(*first, |content| content.clone_from(bytes));
+    }
+    let (valid, records) = read(&disk, bytes, None);
+    assert_eq!((valid, records), read(&disk, bytes, None), "the same segments, read twice");
+    read(&disk, bytes, Some(3));
+    let contents = disk.firsts().into_iter().map(|it| (it, disk.with_content(it, |it| it.clone())));
+    assert_eq!(contents.collect::<Vec<_>>(), segments, "a reader writes nothing");
     valid && records > 0
 }
 
@@ -86,12 +91,11 @@ fn header(first: u64) -> Vec<u8> {
     header
 }
 
-/// Reads all items, and checks that each number is in exactly one. Returns whether there is no
-/// damage, and the number of records.
-fn read(segments: &[(u64, Vec<u8>)], from: Option<u64>) -> (bool, usize) {
-    let bytes: usize = segments.iter().map(|(_, bytes)| bytes.len()).sum();
-    let mut reader = SpoolReader::with_storage(ReadOnly(segments), STREAM, from);
-    let mut expected = from.or(segments.first().map(|(first, _)| *first)).unwrap_or(0);
+/// Reads all items of `bytes` bytes, and checks that each number is in exactly one. Returns whether
+/// there is no damage, and the number of records.
+fn read(disk: &SimulatedDisk, bytes: usize, from: Option<u64>) -> (bool, usize) {
+    let mut reader = SpoolReader::with_storage(disk.clone(), STREAM, from);
+    let mut expected = from.or(disk.firsts().first().copied()).unwrap_or(0);
     let (mut valid, mut records, mut items) = (true, 0, 0);
     while let Some(item) = budget::within(MEMORY, || reader.next()) {
         items += 1;
@@ -138,63 +142,4 @@ fn parse(record: &SpoolRecord) {
     let Some(parsed) = parsed else { return };
     assert_eq!(parsed.kind(), record.kind);
     assert_eq!(SpooledRecord::parse(record.kind, &parsed.to_payload()).unwrap(), parsed);
-}
-
-#[derive(Clone, Copy)]
-struct ReadOnly<'a>(&'a [(u64, Vec<u8>)]);
-
-struct ReadOnlySegment<'a>(&'a [u8]);
-
-impl<'a> SpoolStorage for ReadOnly<'a> {
-    type File = ReadOnlySegment<'a>;
-
-    fn list(&self) -> io::Result<Vec<(u64, u64)>> {
-        Ok(self.0.iter().map(|(first, bytes)| (*first, bytes.len() as u64)).collect())
-    }
-
-    fn open(&self, first: u64) -> io::Result<ReadOnlySegment<'a>> {
-        let found = self.0.iter().find(|segment| segment.0 == first);
-        found.map(|(_, bytes)| ReadOnlySegment(bytes)).ok_or_else(|| io::ErrorKind::NotFound.into())
-    }
-
-    fn create(&self) -> io::Result<ReadOnlySegment<'a>> {
-        Err(io::ErrorKind::ReadOnlyFilesystem.into())
-    }
-
-    fn publish(&self, _: u64) -> io::Result<()> {
-        Err(io::ErrorKind::ReadOnlyFilesystem.into())
-    }
-
-    fn remove(&self, _: u64) -> io::Result<()> {
-        Err(io::ErrorKind::ReadOnlyFilesystem.into())
-    }
-
-    fn sync_names(&self) -> io::Result<()> {
-        Ok(())
-    }
-}
-
-impl SegmentFile for ReadOnlySegment<'_> {
-    fn length(&self) -> io::Result<u64> {
-        Ok(self.0.len() as u64)
-    }
-
-    fn is_linked(&self) -> io::Result<bool> {
-        Ok(true)
-    }
-
-    fn read_at(&self, into: &mut [u8], offset: u64) -> io::Result<usize> {
-        let rest = self.0.get(offset as usize..).unwrap_or_default();
-        let read = rest.len().min(into.len());
-        into[..read].copy_from_slice(&rest[..read]);
-        Ok(read)
-    }
-
-    fn append(&mut self, _: &[u8]) -> io::Result<()> {
-        Err(io::ErrorKind::ReadOnlyFilesystem.into())
-    }
-
-    fn sync(&self) -> io::Result<()> {
-        Ok(())
-    }
 }

@@ -14,7 +14,6 @@ use gleaner_trust::{
 use crate::budget;
 use crate::input::FuzzInput;
 
-/// Modes of an input.
 pub mod mode {
     /// An envelope follows.
     pub const ENVELOPE: u8 = 0;
@@ -135,7 +134,6 @@ pub(crate) fn root() -> TrustRoot {
     }
 }
 
-/// Signs any bytes as a payload of this type.
 pub(crate) fn signed(payload_type: &str, payload: &[u8]) -> Vec<u8> {
     let mut message =
         format!("DSSEv1 {} {payload_type} {} ", payload_type.len(), payload.len()).into_bytes();

@@ -1,6 +1,6 @@
 //! Values of `[config]` of the lambda, as the deployment sets them.
 
-use crate::bindings;
+use crate::world;
 use crate::{Error, Result};
 
 /// Value of a `[config]` entry.
@@ -98,9 +98,9 @@ fn wrong(key: &str, wanted: &str) -> Error {
     Error::new(format!("`{key}` in [config] is not {wanted}"))
 }
 
-impl From<Vec<bindings::ConfigEntry>> for Config {
-    fn from(entries: Vec<bindings::ConfigEntry>) -> Self {
-        use bindings::ConfigValue as Wit;
+impl From<Vec<world::ConfigEntry>> for Config {
+    fn from(entries: Vec<world::ConfigEntry>) -> Self {
+        use world::ConfigValue as Wit;
         let value = |value| match value {
             Wit::Boolean(value) => ConfigValue::Boolean(value),
             Wit::Integer(value) => ConfigValue::Integer(value),

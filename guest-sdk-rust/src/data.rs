@@ -2,13 +2,13 @@
 //! values (65,536) below are the defaults of `call_bytes` and `call_items` in `[limits]`. The
 //! manifest and the vehicle can lower them.
 
-use crate::bindings::gleaner::lambda::data as wit;
-pub use crate::bindings::gleaner::lambda::data::Tick;
-pub use crate::bindings::gleaner::lambda::types::{
-    Counts, DataError, Encoding, FrameInfo, Guid, Identity, Roi, Stamps, Value,
-};
 pub use crate::error::DataErrorKind;
 use crate::error::into_result;
+use crate::world::gleaner::lambda::data as wit;
+pub use crate::world::gleaner::lambda::data::Tick;
+pub use crate::world::gleaner::lambda::types::{
+    Counts, DataError, Encoding, FrameInfo, Guid, Identity, Roi, Stamps, Value,
+};
 use crate::{Error, Result};
 
 /// Bytes that one call copies where several are needed: copying reaches memory bandwidth at this
@@ -372,8 +372,8 @@ impl Column {
     }
 }
 
-impl From<crate::bindings::gleaner::lambda::types::Column> for Column {
-    fn from(column: crate::bindings::gleaner::lambda::types::Column) -> Self {
+impl From<crate::world::gleaner::lambda::types::Column> for Column {
+    fn from(column: crate::world::gleaner::lambda::types::Column) -> Self {
         Self { at_ns: column.at_ns, values: column.values }
     }
 }

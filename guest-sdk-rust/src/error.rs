@@ -2,10 +2,10 @@
 
 use std::fmt;
 
-use crate::bindings::gleaner::lambda::inference::InferenceError;
-use crate::bindings::gleaner::lambda::scratch::ScratchError;
-use crate::bindings::gleaner::lambda::trigger::TriggerError;
-use crate::bindings::gleaner::lambda::types::DataError;
+use crate::world::gleaner::lambda::inference::InferenceError;
+use crate::world::gleaner::lambda::scratch::ScratchError;
+use crate::world::gleaner::lambda::trigger::TriggerError;
+use crate::world::gleaner::lambda::types::DataError;
 
 /// An error message. If a handler returns it, the wake is a fault. If the first `init` returns it,
 /// the lambda does not start.

@@ -24,14 +24,14 @@
 //! }
 //! ```
 
-use crate::bindings::gleaner::lambda::inference as wit;
-pub use crate::bindings::gleaner::lambda::inference::{
-    DetectOptions, Detection, ElementType, InferenceError, TensorInfo,
-};
-pub use crate::bindings::gleaner::lambda::types::{Placement, Preprocess};
 use crate::data::{Frame, PIECE};
 pub use crate::error::InferenceErrorKind;
 use crate::error::{into_result, refused};
+use crate::world::gleaner::lambda::inference as wit;
+pub use crate::world::gleaner::lambda::inference::{
+    DetectOptions, Detection, ElementType, InferenceError, TensorInfo,
+};
+pub use crate::world::gleaner::lambda::types::{Placement, Preprocess};
 use crate::{Error, Result};
 
 /// An array in row-major order, kept in the host. Tensors of a lambda count against `memory` in

@@ -2,9 +2,9 @@
 
 use std::cell::RefCell;
 
-use crate::bindings::gleaner::lambda::data::Wake;
-use crate::bindings::{ConfigEntry, Guest};
 use crate::data::{Sample, Tick};
+use crate::world::gleaner::lambda::data::Wake;
+use crate::world::{ConfigEntry, Guest};
 use crate::{Config, Error, Result};
 
 /// A lambda. The host calls its methods, one at a time.
@@ -88,7 +88,7 @@ macro_rules! lambda {
 
         const _: () = {
             type Exported = $crate::Exported<$lambda>;
-            $crate::bindings::export_lambda!(Exported);
+            $crate::world::export_lambda!(Exported);
         };
     };
 }

@@ -55,20 +55,14 @@ macro_rules! conversions {
     };
 }
 
-// Generated, and compared with what is generated.
-#[cfg(target_family = "wasm")]
+// Generated, and compared with what is generated. Natively, only its data types are used.
+#[allow(dead_code, unused_imports, clippy::too_many_lines)]
 #[doc(hidden)]
 #[rustfmt::skip]
 pub mod bindings;
 mod config;
 pub mod data;
 mod error;
-// The same file: natively, only its data types are used.
-#[allow(dead_code, unused_imports, clippy::too_many_lines)]
-#[cfg(not(target_family = "wasm"))]
-#[path = "bindings.rs"]
-#[rustfmt::skip]
-mod generated;
 pub mod inference;
 pub mod kernels;
 mod lambda;
@@ -78,6 +72,9 @@ pub mod scratch;
 pub mod testing;
 pub mod trigger;
 
+#[cfg(target_family = "wasm")]
+#[doc(hidden)]
+pub use bindings as world;
 pub use config::{Config, ConfigValue};
 pub use data::{Column, Encoding, Field, Frame, Sample, Tick, Topic, input, inputs, now_ns};
 pub use error::{Error, ErrorKind, Result};
@@ -87,5 +84,5 @@ pub use lambda::Lambda;
 pub use lambda::{Exported, Instance};
 #[cfg(not(target_family = "wasm"))]
 #[doc(hidden)]
-pub use testing::bindings;
+pub use testing::bindings as world;
 pub use trigger::{event, start, stop};

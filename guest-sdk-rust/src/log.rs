@@ -2,8 +2,8 @@
 //! `log_lines` lines and `log_bytes` bytes, as set in `[limits]`: by default 100 lines and 400 KiB.
 //! It drops and counts further lines.
 
-use crate::bindings::gleaner::lambda::log as wit;
-pub use crate::bindings::gleaner::lambda::log::Level;
+use crate::world::gleaner::lambda::log as wit;
+pub use crate::world::gleaner::lambda::log::Level;
 
 /// Writes one line. `message` is truncated to 4,096 bytes, at a character boundary.
 pub fn log(level: Level, message: &str) {

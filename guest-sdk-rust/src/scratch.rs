@@ -6,10 +6,10 @@
 //! write it.
 
 use crate::Result;
-use crate::bindings::gleaner::lambda::scratch as wit;
-pub use crate::bindings::gleaner::lambda::scratch::{Entry, ScratchError};
 pub use crate::error::ScratchErrorKind;
 use crate::error::into_result;
+use crate::world::gleaner::lambda::scratch as wit;
+pub use crate::world::gleaner::lambda::scratch::{Entry, ScratchError};
 
 /// Stores `bytes` under a name; replaces an existing entry.
 ///

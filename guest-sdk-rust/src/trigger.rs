@@ -5,10 +5,10 @@
 //! `init` all triggers are refused.
 
 use crate::Result;
-use crate::bindings::gleaner::lambda::trigger as wit;
-pub use crate::bindings::gleaner::lambda::trigger::TriggerError;
 pub use crate::error::TriggerErrorKind;
 use crate::error::into_result;
+use crate::world::gleaner::lambda::trigger as wit;
+pub use crate::world::gleaner::lambda::trigger::TriggerError;
 
 /// Builds an event, which [`EventBuilder::send`] reports. An event opens the `[record]` window
 /// around the sample or tick of this wake. `score` is the strength of the event, in a unit that the

@@ -10,13 +10,13 @@ use std::time::Instant;
 use clap::Args;
 use gleaner_base::{Exit, Failure};
 use gleaner_buffers::Pool;
-use gleaner_jail::Paths;
 use gleaner_lambda::manifest::{InputSpec, Manifest, Store, bounds};
 use gleaner_lambda::{BuildDir, Fault};
 use gleaner_messages::Sources;
+use gleaner_messages::transport::loopback::Loopback;
 use gleaner_protocol::ingress::TopicGrant;
 use gleaner_protocol::{CheckReport, Need, NeedPlace, Report};
-use gleaner_transport::loopback::Loopback;
+use gleaner_sandbox::Paths;
 
 use crate::api::frame::Info;
 use crate::input::Remap;
@@ -44,10 +44,6 @@ pub struct CheckJob {
 
 impl CheckJob {
     /// Checks the arguments against the build and its manifest.
-    ///
-    /// # Errors
-    ///
-    /// A failure that names the manifest's line, the key or the topic, and the way out.
     pub fn new(args: CheckArgs) -> Result<Self, Failure> {
         let build = BuildDir::check_fresh(&args.lambda_args.lambda)?;
         let mut manifest = Manifest::load(build.path())?;
@@ -65,10 +61,6 @@ impl CheckJob {
     }
 
     /// Runs the check and reports its result.
-    ///
-    /// # Errors
-    ///
-    /// A failure that explains why the lambda cannot start.
     pub fn run(self, load: Load<'_>, reports: &mut dyn Write) -> Result<Exit, Failure> {
         let Self { lambda, manifest } = self;
         let (mut topics, notes) = topics(&lambda, &manifest)?;
@@ -171,66 +163,39 @@ fn input_needs(input: &InputSpec) -> Vec<Need> {
 fn needs(lambda: &ConfiguredLambda, manifest: &Manifest) -> Vec<Need> {
     let limits = &manifest.limits;
     let mut needs: Vec<Need> = manifest.inputs.iter().flat_map(input_needs).collect();
-    let mut need = |place, preallocated, purpose: String, bytes| {
-        needs.push(Need { purpose, bytes, place, preallocated })
+    let need = |place, preallocated, purpose: &str, bytes| {
+        let purpose = purpose.to_owned();
+        Need { purpose, bytes, place, preallocated }
     };
-    need(
-        NeedPlace::Memory,
-        false,
-        "the lambda itself (`memory`)".to_owned(),
-        Some(limits.memory.bytes()),
-    );
+    let memory = |purpose, bytes| need(NeedPlace::Memory, false, purpose, Some(bytes));
+    let disk = |purpose| need(NeedPlace::Disk, false, purpose, None);
+    needs.push(memory("the lambda itself (`memory`)", limits.memory.bytes()));
     if manifest.inputs.iter().any(|input| input.type_name.is_frame()) {
-        need(
-            NeedPlace::Memory,
-            false,
-            "frames that the lambda creates (also up to `memory`)".to_owned(),
-            Some(limits.memory.bytes()),
-        );
+        let purpose = "frames that the lambda creates (also up to `memory`)";
+        needs.push(memory(purpose, limits.memory.bytes()));
     }
     if limits.scratch.bytes() > 0 {
-        let bytes = limits.scratch.bytes().saturating_mul(2);
-        need(
-            NeedPlace::Memory,
-            false,
-            "its scratch entries (`scratch`, twice while an entry grows)".to_owned(),
-            Some(bytes),
-        );
+        let purpose = "its scratch entries (`scratch`, twice while an entry grows)";
+        needs.push(memory(purpose, limits.scratch.bytes().saturating_mul(2)));
     }
-    need(NeedPlace::Memory, false, "queued decisions".to_owned(), Some(UNWRITTEN));
+    needs.push(memory("queued decisions", UNWRITTEN));
     if let Some(record) = &manifest.record {
         let (place, preallocated) = match record.store {
             Store::Ram => (NeedPlace::Memory, true),
             Store::Disk => (NeedPlace::Disk, false),
         };
-        need(
-            place,
-            preallocated,
-            "recorder: preroll".to_owned(),
-            Some(record.preroll_size.bytes()),
-        );
-        need(
-            NeedPlace::Memory,
-            false,
-            "recorder: queued messages, and clips being written".to_owned(),
-            Some(RECORDER),
-        );
-        need(
-            NeedPlace::Disk,
-            false,
-            "clips; limit them by `gleaner run --clips-max` or `--bytes-max`".to_owned(),
-            None,
-        );
+        let preroll = Some(record.preroll_size.bytes());
+        needs.extend([
+            need(place, preallocated, "recorder: preroll", preroll),
+            memory("recorder: queued messages, and clips being written", RECORDER),
+            disk("clips; limit them by `gleaner run --clips-max` or `--bytes-max`"),
+        ]);
     }
     for model in &manifest.models {
         let file = lambda.build.path().join(model.file.as_path());
-        need(
-            NeedPlace::Disk,
-            true,
-            format!("model `{}`", model.name),
-            file.metadata().ok().map(|data| data.len()),
-        );
+        let bytes = file.metadata().ok().map(|data| data.len());
+        needs.push(need(NeedPlace::Disk, true, &format!("model `{}`", model.name), bytes));
     }
-    need(NeedPlace::Disk, false, "decisions.jsonl and log.jsonl".to_owned(), None);
+    needs.push(disk("decisions.jsonl and log.jsonl"));
     needs
 }

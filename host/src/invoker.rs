@@ -84,10 +84,6 @@ impl Invoker {
     }
 
     /// Ends a lambda that runs in another process, after its last wake.
-    ///
-    /// # Errors
-    ///
-    /// As [`Guest::finish`].
     pub fn finish(&mut self) -> Result<Option<Totals>, Fault> {
         self.guest.finish()
     }

@@ -7,19 +7,19 @@
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
+use gleaner_base::programs::cache_dir;
 use gleaner_base::{Exit, Failure, safe_file};
-use gleaner_jail::priority::leave_real_time;
-use gleaner_jail::{JailError, Paths, cgroup, files, memory, sandbox_filter, self_test};
 use gleaner_lambda::manifest::LambdaKind;
-use gleaner_parts::cache_dir;
+use gleaner_protocol::process_stats::{HEARTBEAT_ENV, Heartbeat};
 use gleaner_protocol::{Holds, LAYERS_ENV, Layer, SHIM_ENV};
-use gleaner_vitals::{PULSE_ENV, Pulse};
+use gleaner_sandbox::priority::leave_real_time;
+use gleaner_sandbox::{JailError, Paths, cgroup, files, memory, sandbox_filter, self_test};
 use rustix::process::{Signal, getppid, set_parent_process_death_signal};
 
 /// The sandbox state of this process.
 pub struct Isolation {
     permissions: SandboxPermissions,
-    pulse: Pulse,
+    heartbeat: Heartbeat,
     layers: OnceLock<Result<Vec<Layer>, JailError>>,
     /// Memory of this process when it was sandboxed, in bytes.
     used_at_close: OnceLock<Option<u64>>,
@@ -53,9 +53,9 @@ impl Isolation {
         let failed = |what: &str, error: &dyn std::error::Error| {
             Failure::caused_by(Exit::Internal, what, error)
         };
-        let pulse =
-            Pulse::inherited().map_err(|error| failed("cannot use the shim's page", &error))?;
-        let has_shim = std::env::var_os(PULSE_ENV).is_some();
+        let heartbeat =
+            Heartbeat::inherited().map_err(|error| failed("cannot use the shim's page", &error))?;
+        let has_shim = std::env::var_os(HEARTBEAT_ENV).is_some();
         die_with_parent(if has_shim { Signal::KILL } else { Signal::TERM })?;
         // The shim has done so. Without it, threads are yet to be started.
         leave_real_time()
@@ -69,7 +69,7 @@ impl Isolation {
         }
         Ok(Self {
             permissions,
-            pulse,
+            heartbeat,
             layers: OnceLock::new(),
             used_at_close: OnceLock::new(),
             bounded: OnceLock::new(),
@@ -77,8 +77,8 @@ impl Isolation {
     }
 
     /// The page that the shim reads.
-    pub fn pulse(&self) -> &Pulse {
-        &self.pulse
+    pub fn heartbeat(&self) -> &Heartbeat {
+        &self.heartbeat
     }
 
     /// Limits the memory of an interpreter that has loaded its modules, which count for 256 MiB at
@@ -151,10 +151,6 @@ impl Isolation {
 }
 
 /// Requests `signal` for this process when its parent dies.
-///
-/// # Errors
-///
-/// A failure if the system refuses it.
 pub fn die_with_parent(signal: Signal) -> Result<(), Failure> {
     set_parent_process_death_signal(Some(signal)).map_err(|error| {
         let error = std::io::Error::from(error);
@@ -180,7 +176,7 @@ pub fn before_interpreter(permissions: SandboxPermissions, program: &Path) -> St
     layers.push(files::confine(&paths));
     let bounded = allowed.map(memory::limit).filter(|layer| layer.holds == Holds::No);
     // Without a shim, the process itself creates the page that the shim would read.
-    let has_page = std::env::var_os(PULSE_ENV).is_some();
+    let has_page = std::env::var_os(HEARTBEAT_ENV).is_some();
     let start = sandbox_filter::apply_before_interpreter(has_page);
     layers.push(bounded.map_or(start, |layer| Layer::no(sandbox_filter::START, layer.note)));
     serde_json::to_string(&layers).expect("layers are plain data")

@@ -10,7 +10,7 @@ use std::ptr::{self, NonNull};
 
 use gleaner_buffers::Region;
 #[cfg(target_env = "gnu")]
-use gleaner_vitals::own::LARGE_BYTES;
+use gleaner_protocol::process_stats::own::LARGE_BYTES;
 use rustix::mm::{MapFlags, ProtFlags, mmap_anonymous, munmap};
 
 /// Makes the allocator map each large block and unmap it when it is freed, which is also its

@@ -10,10 +10,10 @@ use std::sync::Arc;
 use clap::{Parser, Subcommand};
 use gleaner_base::{Exit, Failure};
 use gleaner_buffers::Pool;
-#[cfg(feature = "python")]
-use gleaner_jail::cgroup;
 use gleaner_lambda::manifest::{LambdaKind, Manifest};
-use gleaner_transport::StoredMeta;
+use gleaner_messages::transport::StoredMeta;
+#[cfg(feature = "python")]
+use gleaner_sandbox::cgroup;
 #[cfg(feature = "python")]
 use rustix::process::Signal;
 
@@ -330,9 +330,9 @@ fn sandboxed<'a>(
     }
 }
 
-/// See [`gleaner_vitals::start::reports`].
+/// See [`gleaner_protocol::process_stats::start::reports`].
 fn reports() -> Result<File, Failure> {
-    gleaner_vitals::start::reports().map_err(|error| {
+    gleaner_protocol::process_stats::start::reports().map_err(|error| {
         Failure::caused_by(Exit::Internal, "cannot set up the report stream", &error)
     })
 }
@@ -357,7 +357,7 @@ mod wasm {
         let cannot = |error: &WasmError| {
             Failure::because(format!("cannot load lambda `{}`", manifest.lambda.name), error)
         };
-        let cache = gleaner_parts::cache_dir().map_err(|error| cannot(&error.into()))?;
+        let cache = gleaner_base::programs::cache_dir().map_err(|error| cannot(&error.into()))?;
         let limits = &manifest.limits;
         let nans = if manifest.lambda.deterministic { Nans::Canonical } else { Nans::Native };
         let loaded =
@@ -380,7 +380,7 @@ mod wasm {
 
 fn prepare() {
     crate::memory::map_large_blocks();
-    gleaner_vitals::log::init();
+    gleaner_protocol::process_stats::log::init();
 }
 
 fn end(result: Result<Exit, Failure>) -> ExitCode {

@@ -2,20 +2,20 @@
 
 /// First bytes of a journal. A transfer as text would change some of them, which distinguishes it
 /// from other damage.
-pub(super) const MAGIC: [u8; 8] = *b"\x89GLJRN\r\n";
+pub(crate) const MAGIC: [u8; 8] = *b"\x89GLJRN\r\n";
 
 /// Magic, version, and six bytes that are 0.
-pub(super) const PREAMBLE_LEN: usize = 16;
+pub(crate) const PREAMBLE_LEN: usize = 16;
 
 /// Kind, length, checksum of the payload, checksum of the head.
-pub(super) const HEAD_LEN: usize = 13;
+pub(crate) const HEAD_LEN: usize = 13;
 
 /// Longest payload. The header of a build with 10,000 files fits, and the largest wake that the
 /// host allows.
-pub(super) const PAYLOAD_MAX: usize = 2 << 20;
+pub(crate) const PAYLOAD_MAX: usize = 2 << 20;
 
 /// Kinds of blocks. Readers skip blocks of other kinds, which newer writers may add.
-pub(super) mod kind {
+pub(crate) mod kind {
     /// The header, as JSON: the first block only.
     pub(crate) const HEADER: u8 = 1;
     pub(crate) const WAKES: u8 = 2;
@@ -23,14 +23,14 @@ pub(super) mod kind {
     pub(crate) const END: u8 = 3;
 }
 
-pub(super) struct Head {
-    pub(super) kind: u8,
-    pub(super) len: u32,
-    pub(super) payload_crc: u32,
+pub(crate) struct Head {
+    pub(crate) kind: u8,
+    pub(crate) len: u32,
+    pub(crate) payload_crc: u32,
 }
 
 impl Head {
-    pub(super) fn to_bytes(&self, index: u64) -> [u8; HEAD_LEN] {
+    pub(crate) fn to_bytes(&self, index: u64) -> [u8; HEAD_LEN] {
         let mut bytes = [0; HEAD_LEN];
         bytes[0] = self.kind;
         bytes[1..5].copy_from_slice(&self.len.to_le_bytes());
@@ -41,10 +41,8 @@ impl Head {
     }
 
     /// Decodes the head of block number `index`; `None` if the checksum is wrong.
-    pub(super) fn from_bytes(bytes: &[u8; HEAD_LEN], index: u64) -> Option<Head> {
-        let word = |at: usize| {
-            u32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]])
-        };
+    pub(crate) fn from_bytes(bytes: &[u8; HEAD_LEN], index: u64) -> Option<Head> {
+        let word = |at| u32::from_le_bytes(bytes[at..at + 4].try_into().expect("4 bytes"));
         (word(9) == head_crc(bytes, index)).then(|| Head {
             kind: bytes[0],
             len: word(1),

@@ -2,12 +2,12 @@
 
 use serde_json::{Map, Value};
 
-use super::entry::{InputView, JournalEntry, LogDigest, WakeSource};
-use super::number::{take, unfold};
-use super::previous::{
+use crate::entry::{InputView, JournalEntry, LogDigest, WakeSource};
+use crate::number::{NUMBER_MAX, take, unfold};
+use crate::previous::{
     FAULT_ALLOWED, FAULT_USED, PreviousInput, PreviousWake, TRIGGER_SCORE, flag, newest, seen,
 };
-use super::{ATTRIBUTES_MAX, FAULTS, TRIGGERS_MAX};
+use crate::{ATTRIBUTES_MAX, FAULTS, TRIGGERS_MAX};
 use gleaner_lambda::{Fault, Trigger, TriggerKind};
 
 /// The reason why bytes cannot be decoded as a wake.
@@ -37,7 +37,7 @@ pub enum MalformedWake {
 
 type Result<T> = std::result::Result<T, MalformedWake>;
 
-/// Decodes the output of an [`Encoder`](super::Encoder). Its input is untrusted: no memory is
+/// Decodes the output of an [`Encoder`](crate::Encoder). Its input is untrusted: no memory is
 /// allocated for a count before the counted bytes are known to exist.
 pub struct Decoder {
     previous: PreviousWake,
@@ -68,10 +68,7 @@ impl Decoder {
         }
         let at_ns = difference(bytes, previous.expected_at_ns() as u64)? as i64;
         let cause = cause(flags, previous, bytes)?;
-        let fuel = match flags & flag::FUEL != 0 {
-            true => Some(difference(bytes, previous.fuel)?),
-            false => None,
-        };
+        let fuel = optional(flags & flag::FUEL, || difference(bytes, previous.fuel))?;
         // Each input is encoded in at least one byte: checked before memory is allocated for them.
         if bytes.len() < previous.inputs.len() {
             return Err(MalformedWake::Short);
@@ -79,12 +76,17 @@ impl Decoder {
         let seen =
             previous.inputs.iter().map(|previous| input(previous, bytes)).collect::<Result<_>>()?;
         let triggers = if flags & flag::TRIGGERS != 0 { triggers(bytes)? } else { Vec::new() };
-        let fault = if flags & flag::FAULT != 0 { Some(fault(bytes)?) } else { None };
+        let fault = optional(flags & flag::FAULT, || fault(bytes))?;
         let log = if flags & flag::LOG != 0 { log_digest(bytes)? } else { LogDigest::default() };
         let entry = JournalEntry { at_ns, cause, seen, triggers, fault, fuel, log };
         self.previous.update(&entry);
         Ok(entry)
     }
+}
+
+/// Takes a value whose presence `bit` states.
+fn optional<T>(bit: u8, take: impl FnOnce() -> Result<T>) -> Result<Option<T>> {
+    (bit != 0).then(take).transpose()
 }
 
 /// Removes and returns `N` bytes.
@@ -96,8 +98,8 @@ fn array<const N: usize>(bytes: &mut &[u8]) -> Result<[u8; N]> {
 
 /// Removes and returns a number.
 fn number(bytes: &mut &[u8]) -> Result<u64> {
-    let ends = bytes.iter().take(super::number::NUMBER_MAX).any(|byte| byte & 0x80 == 0);
-    let short = !ends && bytes.len() < super::number::NUMBER_MAX;
+    let ends = bytes.iter().take(NUMBER_MAX).any(|byte| byte & 0x80 == 0);
+    let short = !ends && bytes.len() < NUMBER_MAX;
     take(bytes).ok_or(if short { MalformedWake::Short } else { MalformedWake::Number })
 }
 
@@ -178,10 +180,7 @@ fn trigger(bytes: &mut &[u8]) -> Result<Trigger> {
         _ => return Err(MalformedWake::Unknown { what: "kind of trigger", value: first }),
     };
     let label = text(bytes)?;
-    let score = match first & TRIGGER_SCORE != 0 {
-        true => Some(f64::from_le_bytes(array(bytes)?)),
-        false => None,
-    };
+    let score = optional(first & TRIGGER_SCORE, || array(bytes).map(f64::from_le_bytes))?;
     if score.is_some_and(|score| !score.is_finite()) {
         return Err(MalformedWake::Score);
     }
@@ -203,8 +202,8 @@ fn fault(bytes: &mut &[u8]) -> Result<Fault> {
         return Err(MalformedWake::Unknown { what: "kind of fault", value: first });
     };
     let message = text(bytes)?;
-    let used = if first & FAULT_USED != 0 { Some(number(bytes)?) } else { None };
-    let allowed = if first & FAULT_ALLOWED != 0 { Some(number(bytes)?) } else { None };
+    let used = optional(first & FAULT_USED, || number(bytes))?;
+    let allowed = optional(first & FAULT_ALLOWED, || number(bytes))?;
     Ok(Fault { kind: *kind, message, used, allowed })
 }
 

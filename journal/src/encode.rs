@@ -1,9 +1,9 @@
 //! Encodes the wakes of a journal.
 
-use super::entry::{InputView, JournalEntry, WakeSource};
-use super::fault_code;
-use super::number::{fold, put};
-use super::previous::{
+use crate::entry::{InputView, JournalEntry, WakeSource};
+use crate::fault_code;
+use crate::number::{fold, put};
+use crate::previous::{
     FAULT_ALLOWED, FAULT_USED, PreviousInput, PreviousWake, TRIGGER_SCORE, flag, newest, seen,
 };
 use gleaner_lambda::{Fault, Trigger, TriggerKind};

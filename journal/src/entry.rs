@@ -2,8 +2,8 @@
 
 use serde_json::Value;
 
-use super::header::{Difference, JournalInput};
-use super::{FAULTS, fault_code};
+use crate::header::{Difference, JournalInput, differs};
+use crate::{FAULTS, fault_code};
 use gleaner_base::text::{excerpt, hex};
 use gleaner_lambda::{Fault, Trigger};
 
@@ -35,6 +35,16 @@ pub enum WakeSource {
         /// Number of ticks without a wake since the previous wake.
         missed: u64,
     },
+}
+
+impl WakeSource {
+    fn describe(self, writers: bool) -> String {
+        match self {
+            Self::Sample { writer, seq } => format!("sample {}", identity((writer, seq), writers)),
+            Self::Tick { missed: 0 } => "a tick".to_owned(),
+            Self::Tick { missed } => format!("a tick after {missed} missed ones"),
+        }
+    }
 }
 
 impl Default for WakeSource {
@@ -82,54 +92,31 @@ impl JournalEntry {
         if self.triggers.is_empty() && self == now {
             return None;
         }
-        Difference::of("stamp of the wake, in ns", self.at_ns, now.at_ns)
-            .or_else(|| {
-                Difference::of(
-                    "cause of the wake",
-                    self.cause_in_words(writers),
-                    now.cause_in_words(writers),
-                )
-            })
-            .or_else(|| Difference::of("number of inputs", self.seen.len(), now.seen.len()))
+        let cause = |entry: &JournalEntry| entry.cause.describe(writers);
+        let fault = |entry: &JournalEntry| fault_in_words(&entry.fault);
+        let log = |entry: &JournalEntry| digest(entry.log.digest);
+        differs("stamp of the wake, in ns", self.at_ns, now.at_ns)
+            .or_else(|| differs("cause of the wake", cause(self), cause(now)))
+            .or_else(|| differs("number of inputs", self.seen.len(), now.seen.len()))
             .or_else(|| {
                 let mut pairs = self.seen.iter().zip(&now.seen).enumerate();
                 pairs.find_map(|(index, (journal, now))| {
-                    seen_differs(journal, now, &in_words(inputs, index), writers)
+                    seen_differs(journal, now, &describe(inputs, index), writers)
                 })
             })
-            .or_else(|| {
-                Difference::of("number of triggers", self.triggers.len(), now.triggers.len())
-            })
+            .or_else(|| differs("number of triggers", self.triggers.len(), now.triggers.len()))
             .or_else(|| {
                 let mut pairs = self.triggers.iter().zip(&now.triggers).enumerate();
                 pairs.find_map(|(index, (journal, now))| triggers_differ(journal, now, index + 1))
             })
-            .or_else(|| {
-                Difference::of("fault", fault_in_words(&self.fault), fault_in_words(&now.fault))
-            })
-            .or_else(|| Difference::of("fuel", number(self.fuel), number(now.fuel)))
-            .or_else(|| Difference::of("number of log lines", self.log.lines, now.log.lines))
-            .or_else(|| {
-                Difference::of(
-                    "text of the log lines",
-                    digest(self.log.digest),
-                    digest(now.log.digest),
-                )
-            })
-    }
-
-    fn cause_in_words(&self, writers: bool) -> String {
-        match self.cause {
-            WakeSource::Sample { writer, seq } => {
-                format!("sample {}", identity((writer, seq), writers))
-            }
-            WakeSource::Tick { missed: 0 } => "a tick".to_owned(),
-            WakeSource::Tick { missed } => format!("a tick after {missed} missed ones"),
-        }
+            .or_else(|| differs("fault", fault(self), fault(now)))
+            .or_else(|| differs("fuel", number(self.fuel), number(now.fuel)))
+            .or_else(|| differs("number of log lines", self.log.lines, now.log.lines))
+            .or_else(|| differs("text of the log lines", log(self), log(now)))
     }
 }
 
-fn in_words(inputs: &[JournalInput], index: usize) -> String {
+fn describe(inputs: &[JournalInput], index: usize) -> String {
     match inputs.get(index) {
         Some(input) => format!("input `{}` ({})", excerpt(&input.name), excerpt(&input.wire_topic)),
         None => format!("input {}", index + 1),
@@ -146,24 +133,17 @@ fn seen_differs(
     if journal == now {
         return None;
     }
-    let newest = |seen: &InputView| {
-        seen.newest.map_or("none".to_owned(), |newest| identity(newest, writers))
-    };
-    Difference::of(format!("number of new samples of {input}"), journal.new, now.new)
-        .or_else(|| {
-            Difference::of(format!("newest sample of {input}"), newest(journal), newest(now))
-        })
-        .or_else(|| {
-            Difference::of(
-                format!("samples of {input}"),
-                digest(journal.digest),
-                digest(now.digest),
-            )
-        })
-        .or_else(|| {
-            let what = format!("number of samples of {input} that the lambda looked back");
-            Difference::of(what, journal.reach, now.reach)
-        })
+    let newest = |seen: &InputView| in_words_or_none(seen.newest, |it| identity(it, writers));
+    let samples = |seen: &InputView| digest(seen.digest);
+    let reach = format!("number of samples of {input} that the lambda looked back");
+    differs(format!("number of new samples of {input}"), journal.new, now.new)
+        .or_else(|| differs(format!("newest sample of {input}"), newest(journal), newest(now)))
+        .or_else(|| differs(format!("samples of {input}"), samples(journal), samples(now)))
+        .or_else(|| differs(reach, journal.reach, now.reach))
+}
+
+fn in_words_or_none<T>(value: Option<T>, describe: impl FnOnce(T) -> String) -> String {
+    value.map_or("none".to_owned(), describe)
 }
 
 fn identity((writer, seq): ([u8; 16], u64), writers: bool) -> String {
@@ -178,7 +158,7 @@ fn digest(digest: u32) -> String {
 }
 
 fn number(number: Option<u64>) -> String {
-    number.map_or("none".to_owned(), |number| number.to_string())
+    in_words_or_none(number, |number| number.to_string())
 }
 
 fn fault_in_words(fault: &Option<Fault>) -> String {
@@ -190,19 +170,17 @@ fn fault_in_words(fault: &Option<Fault>) -> String {
 /// Compares triggers as those of twins, but bit for bit and with attributes: it is the same lambda.
 fn triggers_differ(journal: &Trigger, now: &Trigger, index: usize) -> Option<Difference> {
     let what = |part: &str| format!("trigger {index}: {part}");
-    let score =
-        |trigger: &Trigger| trigger.score.map_or("none".to_owned(), |score| score.to_string());
+    let score = |trigger: &Trigger| in_words_or_none(trigger.score, |score| score.to_string());
     let label = |trigger: &Trigger| format!("`{}`", trigger.label);
-    let attribute = |value: Option<&Value>| value.map_or("none".to_owned(), Value::to_string);
+    let attribute = |value: Option<&Value>| in_words_or_none(value, Value::to_string);
     let keys =
         |trigger: &Trigger| trigger.attributes.keys().cloned().collect::<Vec<_>>().join(", ");
-    Difference::of(what("kind"), journal.kind.as_str(), now.kind.as_str())
-        .or_else(|| Difference::of(what("label"), label(journal), label(now)))
-        .or_else(|| match journal.score.map(f64::to_bits) == now.score.map(f64::to_bits) {
-            true => None,
-            false => {
-                Some(Difference { what: what("score"), journal: score(journal), now: score(now) })
-            }
+    differs(what("kind"), journal.kind.as_str(), now.kind.as_str())
+        .or_else(|| differs(what("label"), label(journal), label(now)))
+        .or_else(|| {
+            let is_equal = journal.score.map(f64::to_bits) == now.score.map(f64::to_bits);
+            let (what, journal, now) = (what("score"), score(journal), score(now));
+            (!is_equal).then_some(Difference { what, journal, now })
         })
         .or_else(|| {
             let (journal, now) = (&journal.attributes, &now.attributes);
@@ -210,8 +188,8 @@ fn triggers_differ(journal: &Trigger, now: &Trigger, index: usize) -> Option<Dif
                 journal.keys().chain(now.keys().filter(|key| !journal.contains_key(*key)));
             all.find_map(|key| {
                 let what = what(&format!("attribute `{}`", excerpt(key)));
-                Difference::of(what, attribute(journal.get(key)), attribute(now.get(key)))
+                differs(what, attribute(journal.get(key)), attribute(now.get(key)))
             })
         })
-        .or_else(|| Difference::of(what("order of its attributes"), keys(journal), keys(now)))
+        .or_else(|| differs(what("order of its attributes"), keys(journal), keys(now)))
 }

@@ -2,8 +2,8 @@
 
 use std::io;
 
-use super::block::PAYLOAD_MAX;
-use super::{INPUTS_MAX, MalformedWake, VERSION};
+use crate::block::PAYLOAD_MAX;
+use crate::{INPUTS_MAX, MalformedWake, VERSION};
 use gleaner_base::{Exit, Explain};
 
 /// The reason why a journal cannot be read, or not to its end.
@@ -61,22 +61,19 @@ pub enum Damage {
 
 impl Explain for JournalError {
     fn help(&self) -> Option<String> {
-        Some(match self {
+        let help = match self {
             JournalError::NotAJournal => {
-                "name the file that `gleaner replay --journal FILE` wrote, or a clip".to_owned()
+                "name the file that `gleaner replay --journal FILE` wrote, or a clip"
             }
-            JournalError::NoHeader { .. } => "its writer died early: write a new one".to_owned(),
-            JournalError::Version { found } if *found > VERSION => {
-                "use the gleaner that wrote it".to_owned()
-            }
-            JournalError::Version { .. } => {
-                "use the gleaner that wrote it, or write a new one".to_owned()
-            }
+            JournalError::NoHeader { .. } => "its writer died early: write a new one",
+            JournalError::Version { found } if *found > VERSION => "use the gleaner that wrote it",
+            JournalError::Version { .. } => "use the gleaner that wrote it, or write a new one",
             JournalError::Read { .. } => return None,
             JournalError::Damaged { .. } => {
-                "it was changed after it was written: copy it again, or write a new one".to_owned()
+                "it was changed after it was written: copy it again, or write a new one"
             }
-        })
+        };
+        Some(help.to_owned())
     }
 
     fn exit(&self) -> Exit {

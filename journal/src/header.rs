@@ -64,9 +64,8 @@ impl TimeRange {
         *self == TimeRange::default()
     }
 
-    fn in_words(self) -> String {
-        let time =
-            |ns: Option<i64>, all: &str| ns.map_or_else(|| all.to_owned(), |ns| format!("{ns} ns"));
+    fn describe(self) -> String {
+        let time = |ns: Option<i64>, all: &str| ns.map_or(all.to_owned(), |ns| format!("{ns} ns"));
         format!("from {} to {}", time(self.from_ns, "its start"), time(self.to_ns, "its end"))
     }
 }
@@ -120,20 +119,18 @@ pub struct Difference {
     pub now: String,
 }
 
-impl Difference {
-    /// Returns the difference of `what`, if the two sides are not the same text.
-    pub(super) fn of(
-        what: impl Into<String>,
-        journal: impl ToString,
-        now: impl ToString,
-    ) -> Option<Difference> {
-        let (journal, now) = (journal.to_string(), now.to_string());
-        (journal != now).then(|| Difference {
-            what: what.into(),
-            journal: visible(&journal),
-            now: visible(&now),
-        })
-    }
+/// Returns the difference of `what`, if the two sides are not the same text.
+pub(crate) fn differs(
+    what: impl Into<String>,
+    journal: impl ToString,
+    now: impl ToString,
+) -> Option<Difference> {
+    let (journal, now) = (journal.to_string(), now.to_string());
+    (journal != now).then(|| Difference {
+        what: what.into(),
+        journal: visible(&journal),
+        now: visible(&now),
+    })
 }
 
 impl JournalHeader {
@@ -143,39 +140,26 @@ impl JournalHeader {
     /// `gleaner`, `engine`, `machine` and `wakes_before` are not compared: decisions should not
     /// depend on them.
     pub fn differs_from(&self, now: &JournalHeader) -> Option<Difference> {
-        Difference::of("lambda", &self.lambda, &now.lambda)
-            .or_else(|| Difference::of("version of the lambda", &self.version, &now.version))
-            .or_else(|| Difference::of("kind of the lambda", self.kind.as_str(), now.kind.as_str()))
+        let manifest = "manifest lambda.toml, less [record] and [limits]";
+        differs("lambda", &self.lambda, &now.lambda)
+            .or_else(|| differs("version of the lambda", &self.version, &now.version))
+            .or_else(|| differs("kind of the lambda", self.kind.as_str(), now.kind.as_str()))
             .or_else(|| files_differ("build file", &self.files, &now.files))
-            .or_else(|| {
-                Difference::of(
-                    "manifest lambda.toml, less [record] and [limits]",
-                    &self.manifest,
-                    &now.manifest,
-                )
-            })
+            .or_else(|| differs(manifest, &self.manifest, &now.manifest))
             .or_else(|| limits_differ(&self.limits, &now.limits))
             .or_else(|| files_differ("model", &self.models, &now.models))
             .or_else(|| config_differs(&self.config, &now.config))
             .or_else(|| inputs_differ(&self.inputs, &now.inputs))
-            .or_else(|| Difference::of("schedule of the lambda", self.woken_by(), now.woken_by()))
-            .or_else(|| {
-                Difference::of("remapped topics", self.remaps_in_words(), now.remaps_in_words())
-            })
-            .or_else(|| Difference::of("clock", &self.clock, &now.clock))
-            .or_else(|| {
-                Difference::of("part of the drive", self.part.in_words(), now.part.in_words())
-            })
+            .or_else(|| differs("schedule of the lambda", self.woken_by(), now.woken_by()))
+            .or_else(|| differs("remapped topics", self.remaps_in_words(), now.remaps_in_words()))
+            .or_else(|| differs("clock", &self.clock, &now.clock))
+            .or_else(|| differs("part of the drive", self.part.describe(), now.part.describe()))
     }
 
     fn woken_by(&self) -> String {
-        match self.event_input {
-            None => "the clock".to_owned(),
-            Some(index) => {
-                let name = self.inputs.get(index).map_or("none", |input| &input.name);
-                format!("samples of input `{name}`")
-            }
-        }
+        let Some(index) = self.event_input else { return "the clock".to_owned() };
+        let name = self.inputs.get(index).map_or("none", |input| &input.name);
+        format!("samples of input `{name}`")
     }
 
     fn remaps_in_words(&self) -> String {
@@ -202,39 +186,31 @@ fn files_differ(what: &str, journal: &[FileDigest], now: &[FileDigest]) -> Optio
             return None;
         }
         // Sixteen digits show the difference, unless they were made equal on purpose.
-        let start =
-            |digest: Option<&String>| digest.and_then(|digest| digest.get(..16)).map(str::to_owned);
-        let cut = start(journal) != start(now);
+        let start = |digest: &String| digest.get(..16).map(str::to_owned);
+        let cut = journal.and_then(start) != now.and_then(start);
         let side = |digest: Option<&String>| match digest {
             None => MISSING.to_owned(),
             Some(digest) if cut && digest.len() > 16 => {
-                format!("sha256 {}…", start(Some(digest)).unwrap_or_else(|| digest.clone()))
+                format!("sha256 {}…", start(digest).unwrap_or_else(|| digest.clone()))
             }
             Some(digest) => format!("sha256 {digest}"),
         };
-        Difference::of(format!("{what} `{}`", excerpt(path)), side(journal), side(now))
+        differs(format!("{what} `{}`", excerpt(path)), side(journal), side(now))
     })
 }
 
 fn limits_differ(journal: &Limits, now: &Limits) -> Option<Difference> {
-    let mut pairs = journal.in_words().into_iter().zip(now.in_words());
-    pairs.find_map(|((key, journal), (_, now))| {
-        Difference::of(format!("limit `{key}`"), journal, now)
-    })
+    let mut pairs = journal.describe().into_iter().zip(now.describe());
+    pairs.find_map(|((key, journal), (_, now))| differs(format!("limit `{key}`"), journal, now))
 }
 
 /// Compares config values as text, so that `-0.0` differs from `0.0`, and 1 from 1.0.
 fn config_differs(journal: &Map<String, Value>, now: &Map<String, Value>) -> Option<Difference> {
     let text = |value: Option<&Value>| value.map_or_else(|| MISSING.to_owned(), Value::to_string);
     let keys = journal.keys().chain(now.keys().filter(|key| !journal.contains_key(*key)));
-    let mut differences = keys.filter_map(|key| {
-        Difference::of(
-            format!("config `{}`", excerpt(key)),
-            text(journal.get(key)),
-            text(now.get(key)),
-        )
-    });
-    differences.next()
+    let mut sides = keys.map(|key| (key, text(journal.get(key)), text(now.get(key))));
+    sides
+        .find_map(|(key, journal, now)| differs(format!("config `{}`", excerpt(key)), journal, now))
 }
 
 fn inputs_differ(journal: &[JournalInput], now: &[JournalInput]) -> Option<Difference> {
@@ -244,7 +220,6 @@ fn inputs_differ(journal: &[JournalInput], now: &[JournalInput]) -> Option<Diffe
         format!("`{name}`: {topic}{from}, {type_name}")
     };
     let mut pairs = journal.iter().zip(now);
-    Difference::of("number of inputs", journal.len(), now.len()).or_else(|| {
-        pairs.find_map(|(journal, now)| Difference::of("input", side(journal), side(now)))
-    })
+    differs("number of inputs", journal.len(), now.len())
+        .or_else(|| pairs.find_map(|(journal, now)| differs("input", side(journal), side(now))))
 }

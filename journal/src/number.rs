@@ -2,9 +2,9 @@
 //! the eighth bit means that more follow.
 
 /// Maximum length of a number, in bytes.
-pub(super) const NUMBER_MAX: usize = 10;
+pub(crate) const NUMBER_MAX: usize = 10;
 
-pub(super) fn put(mut number: u64, out: &mut Vec<u8>) {
+pub(crate) fn put(mut number: u64, out: &mut Vec<u8>) {
     while number >= 0x80 {
         out.push(number as u8 | 0x80);
         number >>= 7;
@@ -14,7 +14,7 @@ pub(super) fn put(mut number: u64, out: &mut Vec<u8>) {
 
 /// Removes and returns the number at the start of `bytes`; `None` if it has no end or more than 64
 /// bits.
-pub(super) fn take(bytes: &mut &[u8]) -> Option<u64> {
+pub(crate) fn take(bytes: &mut &[u8]) -> Option<u64> {
     let mut number = 0;
     for (index, byte) in bytes.iter().take(NUMBER_MAX).enumerate() {
         let bits = u64::from(byte & 0x7f);
@@ -33,11 +33,11 @@ pub(super) fn take(bytes: &mut &[u8]) -> Option<u64> {
 
 /// Maps a signed difference to an unsigned number that is small for close numbers (zigzag): 0, -1,
 /// 1, -2 become 0, 1, 2, 3.
-pub(super) fn fold(difference: u64) -> u64 {
+pub(crate) fn fold(difference: u64) -> u64 {
     (difference << 1) ^ (((difference as i64) >> 63) as u64)
 }
 
-pub(super) fn unfold(folded: u64) -> u64 {
+pub(crate) fn unfold(folded: u64) -> u64 {
     (folded >> 1) ^ (folded & 1).wrapping_neg()
 }
 

@@ -4,13 +4,13 @@ use std::io::{self, Read};
 
 use serde::de::DeserializeOwned;
 
-use super::block::{HEAD_LEN, Head, MAGIC, PAYLOAD_MAX, PREAMBLE_LEN, kind};
-use super::decode::Decoder;
-use super::entry::JournalEntry;
-use super::error::{Damage, JournalError};
-use super::header::{JournalEnd, JournalHeader};
-use super::number::take;
-use super::{INPUTS_MAX, VERSION};
+use crate::block::{HEAD_LEN, Head, MAGIC, PAYLOAD_MAX, PREAMBLE_LEN, kind};
+use crate::decode::Decoder;
+use crate::entry::JournalEntry;
+use crate::error::{Damage, JournalError};
+use crate::header::{JournalEnd, JournalHeader};
+use crate::number::take;
+use crate::{INPUTS_MAX, MalformedWake, VERSION};
 
 /// Reads a journal block by block, with one block in memory at a time.
 pub struct JournalReader<R: Read> {
@@ -42,6 +42,11 @@ impl BlockLocation {
     fn damaged(self, why: Damage) -> JournalError {
         JournalError::Damaged { offset: self.offset, block: self.block, wake: self.wake, why }
     }
+
+    fn json<T: DeserializeOwned>(self, payload: &[u8]) -> Result<T, JournalError> {
+        serde_json::from_slice(payload)
+            .map_err(|error| self.damaged(Damage::Json(error.to_string())))
+    }
 }
 
 enum ReadState {
@@ -52,7 +57,7 @@ enum ReadState {
         torn_bytes: u64,
     },
     /// Every further call fails with the same damage; `None` if reading itself failed.
-    Failed(Option<(BlockLocation, Damage)>),
+    Failed(Option<Damage>),
 }
 
 impl<R: Read> JournalReader<R> {
@@ -66,16 +71,13 @@ impl<R: Read> JournalReader<R> {
         let mut source = BlockSource { bytes, offset: 0, blocks: 0 };
         source.preamble()?;
         let at = BlockLocation { offset: source.offset, ..BlockLocation::default() };
-        let (kind, payload) = match source.block().map_err(|stop| stop.into_error(at))? {
-            NextBlock::Block(kind, payload) => (kind, payload),
-            NextBlock::Nothing | NextBlock::Torn(_) => {
-                return Err(JournalError::NoHeader { bytes: source.offset });
-            }
+        let NextBlock::Block(kind, payload) = source.block(at)? else {
+            return Err(JournalError::NoHeader { bytes: source.offset });
         };
         if kind != kind::HEADER {
             return Err(at.damaged(Damage::NotAHeader { kind }));
         }
-        let header: JournalHeader = json(&payload).map_err(|why| at.damaged(why))?;
+        let header: JournalHeader = at.json(&payload)?;
         let inputs = header.inputs.len();
         if inputs > INPUTS_MAX {
             return Err(at.damaged(Damage::Inputs { found: inputs }));
@@ -114,25 +116,26 @@ impl<R: Read> JournalReader<R> {
             match &self.state {
                 ReadState::Reading => {}
                 ReadState::Ended | ReadState::Truncated { .. } => return Ok(None),
-                ReadState::Failed(Some((at, why))) => return Err(at.damaged(why.clone())),
+                ReadState::Failed(Some(why)) => return Err(self.at.damaged(why.clone())),
                 ReadState::Failed(None) => {
                     return Err(JournalError::Read {
                         source: io::Error::other("an earlier read failed"),
                     });
                 }
             }
-            let step = if self.left > 0 {
-                self.decode().map(Some)
-            } else {
-                self.open_block().map(|()| None)
+            let step = match self.left {
+                0 => self.open_block().map(|()| None),
+                _ => self.decode().map(Some),
             };
             match step {
                 Ok(None) => {}
                 Ok(entry) => return Ok(entry),
-                Err(ReadStop::Damage(why)) => self.state = ReadState::Failed(Some((self.at, why))),
-                Err(ReadStop::Read(source)) => {
-                    self.state = ReadState::Failed(None);
-                    return Err(JournalError::Read { source });
+                Err(error) => {
+                    let JournalError::Damaged { why, .. } = &error else {
+                        self.state = ReadState::Failed(None);
+                        return Err(error);
+                    };
+                    self.state = ReadState::Failed(Some(why.clone()));
                 }
             }
         }
@@ -158,42 +161,42 @@ impl<R: Read> JournalReader<R> {
         self.unknown_blocks
     }
 
-    fn decode(&mut self) -> Result<JournalEntry, ReadStop> {
+    fn decode(&mut self) -> Result<JournalEntry, JournalError> {
         let mut rest = &self.block[self.read..];
-        let entry = self.decoder.decode(&mut rest).map_err(Damage::Wake)?;
+        let decoded = self.decoder.decode(&mut rest);
+        let entry = decoded.map_err(|why| self.at.damaged(Damage::Wake(why)))?;
         let unread = rest.len();
         self.read = self.block.len() - unread;
         self.left -= 1;
         self.wake += 1;
         if self.left == 0 && unread > 0 {
-            return Err(ReadStop::Damage(Damage::AfterWakes));
+            return Err(self.at.damaged(Damage::AfterWakes));
         }
         Ok(entry)
     }
 
-    fn open_block(&mut self) -> Result<(), ReadStop> {
+    fn open_block(&mut self) -> Result<(), JournalError> {
         let BlockSource { offset, blocks: block, .. } = self.source;
-        self.at = BlockLocation { offset, block, wake: self.wake };
-        match self.source.block()? {
-            NextBlock::Nothing => self.state = ReadState::Truncated { torn_bytes: 0 },
+        let at = BlockLocation { offset, block, wake: self.wake };
+        self.at = at;
+        match self.source.block(at)? {
             NextBlock::Torn(torn_bytes) => self.state = ReadState::Truncated { torn_bytes },
-            NextBlock::Block(kind::HEADER, _) => {
-                return Err(ReadStop::Damage(Damage::SecondHeader));
-            }
+            NextBlock::Block(kind::HEADER, _) => return Err(at.damaged(Damage::SecondHeader)),
             NextBlock::Block(kind::WAKES, payload) => {
                 let mut wakes = payload.as_slice();
-                self.left = take(&mut wakes).ok_or(Damage::Wake(super::MalformedWake::Short))?;
+                let left = take(&mut wakes).ok_or(Damage::Wake(MalformedWake::Short));
+                self.left = left.map_err(|why| at.damaged(why))?;
                 self.read = payload.len() - wakes.len();
                 if self.left == 0 && !wakes.is_empty() {
-                    return Err(ReadStop::Damage(Damage::AfterWakes));
+                    return Err(at.damaged(Damage::AfterWakes));
                 }
                 self.block = payload;
                 self.decoder.reset();
             }
             NextBlock::Block(kind::END, payload) => {
-                let end = json(&payload)?;
+                let end = at.json(&payload)?;
                 if self.source.fill(&mut [0])? > 0 {
-                    return Err(ReadStop::Damage(Damage::AfterEnd));
+                    return Err(at.damaged(Damage::AfterEnd));
                 }
                 self.end = Some(end);
                 self.state = ReadState::Ended;
@@ -202,36 +205,6 @@ impl<R: Read> JournalReader<R> {
         }
         Ok(())
     }
-}
-
-enum ReadStop {
-    Damage(Damage),
-    Read(io::Error),
-}
-
-impl ReadStop {
-    fn into_error(self, at: BlockLocation) -> JournalError {
-        match self {
-            ReadStop::Damage(why) => at.damaged(why),
-            ReadStop::Read(source) => JournalError::Read { source },
-        }
-    }
-}
-
-impl From<Damage> for ReadStop {
-    fn from(why: Damage) -> Self {
-        ReadStop::Damage(why)
-    }
-}
-
-impl From<io::Error> for ReadStop {
-    fn from(source: io::Error) -> Self {
-        ReadStop::Read(source)
-    }
-}
-
-fn json<T: DeserializeOwned>(payload: &[u8]) -> Result<T, Damage> {
-    serde_json::from_slice(payload).map_err(|error| Damage::Json(error.to_string()))
 }
 
 /// Splits the bytes of a journal into blocks.
@@ -243,9 +216,7 @@ struct BlockSource<R> {
 }
 
 enum NextBlock {
-    /// The bytes end here.
-    Nothing,
-    /// The bytes end within the next block, after this many bytes of the block.
+    /// The bytes end before or within the next block, after this many bytes of the block.
     Torn(u64),
     /// A complete block: its kind and its payload.
     Block(u8, Vec<u8>),
@@ -253,14 +224,14 @@ enum NextBlock {
 
 impl<R: Read> BlockSource<R> {
     /// Reads as many bytes as there are, up to the length of `buffer`; returns their number.
-    fn fill(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+    fn fill(&mut self, buffer: &mut [u8]) -> Result<usize, JournalError> {
         let mut filled = 0;
         while filled < buffer.len() {
             match self.bytes.read(&mut buffer[filled..]) {
                 Ok(0) => break,
                 Ok(n) => filled += n,
                 Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
-                Err(error) => return Err(error),
+                Err(source) => return Err(JournalError::Read { source }),
             }
         }
         self.offset += filled as u64;
@@ -269,7 +240,7 @@ impl<R: Read> BlockSource<R> {
 
     fn preamble(&mut self) -> Result<(), JournalError> {
         let mut preamble = [0; PREAMBLE_LEN];
-        let filled = self.fill(&mut preamble).map_err(|source| JournalError::Read { source })?;
+        let filled = self.fill(&mut preamble)?;
         let compared = filled.min(MAGIC.len());
         if preamble[..compared] != MAGIC[..compared] {
             return Err(JournalError::NotAJournal);
@@ -287,29 +258,29 @@ impl<R: Read> BlockSource<R> {
         }
     }
 
-    fn block(&mut self) -> Result<NextBlock, ReadStop> {
+    /// Reads the block at `at`.
+    fn block(&mut self, at: BlockLocation) -> Result<NextBlock, JournalError> {
         let mut head = [0; HEAD_LEN];
         let filled = self.fill(&mut head)?;
-        match filled {
-            0 => return Ok(NextBlock::Nothing),
-            1..HEAD_LEN => return Ok(NextBlock::Torn(filled as u64)),
-            _ => {}
+        if filled < HEAD_LEN {
+            return Ok(NextBlock::Torn(filled as u64));
         }
         let Some(Head { kind, len, payload_crc }) = Head::from_bytes(&head, self.blocks) else {
-            return self.zeros(&head);
+            return self.zeros(&head, at);
         };
         if len as usize > PAYLOAD_MAX {
-            return Err(ReadStop::Damage(Damage::TooLong { len }));
+            return Err(at.damaged(Damage::TooLong { len }));
         }
         // Allocates as bytes arrive, not by the length in the head.
         let mut payload = Vec::new();
-        let filled = (&mut self.bytes).take(len.into()).read_to_end(&mut payload)?;
+        let filled = (&mut self.bytes).take(len.into()).read_to_end(&mut payload);
+        let filled = filled.map_err(|source| JournalError::Read { source })?;
         self.offset += filled as u64;
         if filled < len as usize {
             return Ok(NextBlock::Torn((HEAD_LEN + filled) as u64));
         }
         if crc32fast::hash(&payload) != payload_crc {
-            return Err(ReadStop::Damage(Damage::Payload));
+            return Err(at.damaged(Damage::Payload));
         }
         self.blocks += 1;
         Ok(NextBlock::Block(kind, payload))
@@ -317,7 +288,11 @@ impl<R: Read> BlockSource<R> {
 
     /// Checks for zeros up to the end: after a loss of power, a file may have its new length, with
     /// zeros in place of data not yet written. Such a block is torn, not damaged.
-    fn zeros(&mut self, head: &[u8; HEAD_LEN]) -> Result<NextBlock, ReadStop> {
+    fn zeros(
+        &mut self,
+        head: &[u8; HEAD_LEN],
+        at: BlockLocation,
+    ) -> Result<NextBlock, JournalError> {
         let mut torn_bytes = HEAD_LEN as u64;
         let mut zeros = head.iter().all(|byte| *byte == 0);
         let mut buffer = [0; 4096];
@@ -329,6 +304,6 @@ impl<R: Read> BlockSource<R> {
             torn_bytes += filled as u64;
             zeros = buffer[..filled].iter().all(|byte| *byte == 0);
         }
-        Err(ReadStop::Damage(Damage::Head))
+        Err(at.damaged(Damage::Head))
     }
 }

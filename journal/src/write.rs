@@ -4,12 +4,12 @@ use std::io::{self, Write};
 
 use serde::Serialize;
 
-use super::block::{HEAD_LEN, Head, MAGIC, PAYLOAD_MAX, PREAMBLE_LEN, kind};
-use super::encode::Encoder;
-use super::entry::JournalEntry;
-use super::header::{JournalEnd, JournalHeader};
-use super::number::{NUMBER_MAX, put};
-use super::{ATTRIBUTES_MAX, INPUTS_MAX, TRIGGERS_MAX, VERSION};
+use crate::block::{HEAD_LEN, Head, MAGIC, PAYLOAD_MAX, PREAMBLE_LEN, kind};
+use crate::encode::Encoder;
+use crate::entry::JournalEntry;
+use crate::header::{JournalEnd, JournalHeader};
+use crate::number::{NUMBER_MAX, put};
+use crate::{ATTRIBUTES_MAX, INPUTS_MAX, TRIGGERS_MAX, VERSION};
 
 /// Length at which a block of wakes is written: small enough that its checksum locates damage.
 const CLOSE_AT: usize = 32 << 10;
@@ -56,9 +56,7 @@ impl<W: Write> JournalWriter<W> {
         let encoder = Encoder::new(inputs);
         let mut writer =
             JournalWriter { out, encoder, inputs, block, wakes: 0, blocks: 0, failed: false };
-        let mut bytes = Vec::with_capacity(PREAMBLE_LEN);
-        bytes.extend_from_slice(&MAGIC);
-        bytes.extend_from_slice(&VERSION.to_le_bytes());
+        let mut bytes = [&MAGIC[..], &VERSION.to_le_bytes()].concat();
         bytes.resize(PREAMBLE_LEN, 0);
         writer.write_json(kind::HEADER, header, &bytes)?;
         Ok(writer)
@@ -134,7 +132,7 @@ impl<W: Write> JournalWriter<W> {
     }
 
     #[cfg(test)]
-    pub(super) fn written(&self) -> &W {
+    pub(crate) fn written(&self) -> &W {
         &self.out
     }
 

@@ -231,7 +231,7 @@ mod tests {
     use std::time::Duration;
 
     use super::*;
-    use crate::test_folder::TestFolder;
+    use gleaner_test_support::TestFolder;
 
     /// Creates a lambda's folder with these files, each a second newer than the one before.
     fn lambda(kind: &str, files: &[&str]) -> TestFolder {

@@ -13,10 +13,6 @@ mod output_lock;
 pub mod results;
 pub mod signals;
 mod sources;
-#[cfg(test)]
-#[path = "../../base/src/test_folder.rs"]
-mod test_folder;
-mod vehicle;
 
 pub use clip::{Clip, ClipLambda, ClipTopic, Moment, Recovered};
 pub use decision::{
@@ -24,12 +20,11 @@ pub use decision::{
 };
 pub use layout::{BuildDir, LayoutError};
 pub use log_line::{LogLevel, LogLine};
-pub use manifest::{Manifest, ManifestError};
+pub use manifest::{
+    DeploymentSettings, InferenceLimits, Manifest, ManifestError, MetricsSettings, NetworkSettings,
+    RecordingSettings, Vehicle, VehicleIdentity,
+};
 pub use output::{Output, OutputError, RESULTS};
 pub use output_lock::{OutputLock, OutputLockError};
 pub use results::RESULT_ITEM_MAX;
 pub use sources::{REQUIREMENTS, SOURCE_MAX, Sources};
-pub use vehicle::{
-    DeploymentSettings, InferenceLimits, MetricsSettings, NetworkSettings, RecordingSettings,
-    Vehicle, VehicleIdentity,
-};

@@ -276,7 +276,7 @@ fn cut_partial_line(path: &Path) -> io::Result<()> {
 mod tests {
     use super::*;
     use crate::LogLevel;
-    use crate::test_folder::TestFolder;
+    use gleaner_test_support::TestFolder;
 
     fn times(folder: &Path, name: &str) -> Vec<i64> {
         let text = fs::read_to_string(folder.join(name)).unwrap_or_default();

@@ -164,7 +164,7 @@ fn has_extension(file: &Path, wanted: &str) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::test_folder::TestFolder;
+    use gleaner_test_support::TestFolder;
 
     fn sources(dir: &TestFolder, kind: &str, entry: &str) -> [Vec<String>; 2] {
         let manifest = format!(

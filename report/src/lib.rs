@@ -20,6 +20,8 @@ mod measurements;
 mod page;
 mod results;
 mod run_summary;
+#[cfg(test)]
+mod tests;
 
 pub use diff::{
     ChangeCounts, ChangeKind, ComparedRun, Cost, Diff, DiffError, Difference, DifferenceKind,

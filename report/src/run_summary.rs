@@ -195,7 +195,7 @@ impl RunSummary {
                 ("ticks missed", ticks),
                 ("log lines over the rate limit", log),
                 ("triggers refused, over `events_per_minute`", refused),
-                ("wakes skipped in the pauses after repeated faults", backed_off),
+                ("wakes skipped while backing off after faults", backed_off),
             ]
         };
         match self {
@@ -331,7 +331,7 @@ pub(crate) fn signals(out: &Path, notes: &mut Vec<String>) -> Result<Option<Sign
         }
         Err(error) => {
             // The error may quote a text of the file.
-            notes.push(cut(&in_words(&error), WHY_CHARS));
+            notes.push(cut(&describe(&error), WHY_CHARS));
             return Ok(None);
         }
     };
@@ -371,7 +371,7 @@ fn is_consistent(curve: &Curve) -> bool {
 }
 
 /// Formats an error and its causes in one line.
-pub(crate) fn in_words(error: &dyn std::error::Error) -> String {
+pub(crate) fn describe(error: &dyn std::error::Error) -> String {
     let mut text = error.to_string();
     let mut source = error.source();
     while let Some(error) = source {

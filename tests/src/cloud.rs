@@ -30,10 +30,6 @@ impl TestCloud {
 
     /// Starts the program, and waits until it serves. Returns the line with the first code, if
     /// there is one.
-    ///
-    /// # Panics
-    ///
-    /// If it does not start.
     pub fn start(&mut self) -> Option<String> {
         let mut command = Command::new(program("gleaner-cloud"));
         command.arg("serve").arg("--data").arg(self.path("data"));
@@ -63,11 +59,7 @@ impl TestCloud {
         }
     }
 
-    /// Copies its data to the folder `name` while it runs, as docs/cloud.md has it.
-    ///
-    /// # Panics
-    ///
-    /// If that fails.
+    /// Copies its data to the folder `name` while it runs, as docs/cloud-operation.md has it.
     pub fn back_up(&self, name: &str) {
         let (data, copy) = (self.path("data"), self.path(name));
         std::fs::create_dir(&copy).expect("a folder");
@@ -81,7 +73,6 @@ impl TestCloud {
         }
     }
 
-    /// Returns a path in its folder.
     pub fn path(&self, name: &str) -> PathBuf {
         self.folder.path().join(name)
     }
@@ -102,10 +93,6 @@ impl TestCloud {
     }
 
     /// Runs `gleaner` as a user of the cloud; returns its standard output.
-    ///
-    /// # Panics
-    ///
-    /// If it fails.
     pub fn succeeds(&self, args: &[&str]) -> String {
         let output = self.gleaner(args);
         assert!(output.status.success(), "{args:?}: {}", text(&output));
@@ -113,10 +100,6 @@ impl TestCloud {
     }
 
     /// Returns a vehicle as the cloud lists it.
-    ///
-    /// # Panics
-    ///
-    /// If there is none of this name.
     pub fn vehicle(&self, name: &str) -> VehicleSummary {
         let all = self.succeeds(&["vehicles", "--json"]);
         let mut all: Vec<VehicleSummary> = serde_json::from_str(&all).expect("a list");

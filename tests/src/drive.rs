@@ -39,11 +39,8 @@ pub const TICKER_IMU: &str = with_header!(
      MSG: geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n"
 );
 
-/// A topic of a drive.
 pub struct TopicMessages {
-    /// Name of the topic.
     pub topic: String,
-    /// ROS type.
     pub type_name: String,
     /// Definition of the type.
     pub schema: String,
@@ -52,7 +49,6 @@ pub struct TopicMessages {
 }
 
 impl TopicMessages {
-    /// The IMU of the sample drive.
     pub fn sample_imu() -> Self {
         let bytes = std::fs::read(sample_drive()).expect("the sample drive exists");
         let messages = mcap::MessageStream::new(&bytes)
@@ -188,7 +184,6 @@ pub fn with_topics(folder: &TempFolder, topics: u16) -> PathBuf {
 /// A message of the sample drive that a test may change.
 #[derive(Clone, Debug)]
 pub struct DriveMessage {
-    /// Topic of the message.
     pub topic: String,
     /// Time in seconds after the drive's first message.
     pub at_s: f64,
@@ -276,7 +271,6 @@ impl CdrBuilder {
         self
     }
 
-    /// Appends a string.
     pub fn text(self, text: &str) -> Self {
         let mut cdr = self.u32(text.len() as u32 + 1);
         cdr.0.extend(text.as_bytes());

@@ -2,14 +2,13 @@
 
 use std::path::Path;
 
-use gleaner_image::{decode_rgb8, probe};
 use gleaner_messages::{Definitions, Endian, FieldPath, MessageValue};
+use gleaner_pixels::{decode_rgb8, probe};
 use gleaner_sdk::data::Encoding;
 use gleaner_sdk::testing::{FieldValue, Message};
 
 /// One message, with its input and log time.
 pub struct FakeMessage {
-    /// The input that it goes to.
     pub input: &'static str,
     /// Its log time.
     pub at_ns: i64,
@@ -24,10 +23,6 @@ pub type InputFields = (&'static str, &'static str, &'static [&'static str]);
 pub const STAMP: [&str; 2] = ["header.stamp.sec", "header.stamp.nanosec"];
 
 /// The messages of `drive`, an MCAP file, by log time. JPEG is decoded as by the host.
-///
-/// # Panics
-///
-/// If the drive cannot be read.
 pub fn messages(drive: &Path, wanted: &[InputFields]) -> Vec<FakeMessage> {
     let bytes = std::fs::read(drive).expect("the drive exists");
     let mut last_seq = vec![0; wanted.len()];

@@ -1,5 +1,6 @@
 //! Shared by the suites: paths of the checkout, replays, and drives made for tests.
 
+pub mod architecture;
 pub mod bag;
 pub mod budgets;
 pub mod cloud;
@@ -11,11 +12,7 @@ pub mod markdown;
 pub mod namespace;
 pub mod parts;
 pub mod peers;
-pub mod random;
 pub mod readers;
-pub mod rooms;
-#[path = "../../base/src/shared_data.rs"]
-mod shared_data;
 pub mod transcript;
 pub mod tree;
 pub mod vehicle;
@@ -32,7 +29,7 @@ use gleaner_lambda::manifest::Manifest;
 use gleaner_lambda::{Clip, Decision};
 use gleaner_protocol::{ReplaySummary, Report, Verified};
 use gleaner_report::format::{seconds, trigger_lines};
-pub use shared_data::shared_file;
+pub use gleaner_test_support::shared_file;
 
 /// The checkout; of `gleaner-bench` in an unpacked tarball, the folder of the tarball, where all
 /// that it reads has the same place.
@@ -62,10 +59,6 @@ pub fn sample_drive() -> PathBuf {
 }
 
 /// A program of the workspace: built into the same folder as this one, or of the same tarball.
-///
-/// # Panics
-///
-/// If it is not built.
 pub fn program(name: &str) -> PathBuf {
     find_program(name).unwrap_or_else(|| panic!("{name} is not built; run: cargo xtask test"))
 }
@@ -85,10 +78,6 @@ pub fn find_program(name: &str) -> Option<PathBuf> {
 
 /// Number of repetitions of a test: the variable `name`, else `usual`, which is short, or twenty
 /// times that with `GLEANER_LONG=1`. CONTRIBUTING.md ("Tests") lists the variables.
-///
-/// # Panics
-///
-/// If the variable is not a whole number above 0: a test without repetitions would pass.
 pub fn times(name: &str, usual: u32) -> u32 {
     let is_long = std::env::var_os("GLEANER_LONG").is_some_and(|value| value == "1");
     let Some(value) = std::env::var_os(name) else {
@@ -121,7 +110,6 @@ impl TempFolder {
         }
     }
 
-    /// Its path.
     pub fn path(&self) -> &Path {
         &self.0
     }
@@ -142,17 +130,13 @@ impl Drop for TempFolder {
     }
 }
 
-/// Results of a replay.
 pub struct ReplayRun {
     /// Exit code; 128 and more for a signal.
     pub exit: i32,
     /// Its standard error.
     pub stderr: String,
-    /// `decisions.jsonl`.
     pub decisions: Vec<Decision>,
-    /// `log.jsonl`.
     pub log: Vec<serde_json::Value>,
-    /// `clips.jsonl`.
     pub clips: Vec<Clip>,
     /// The final report; `None` if there was none.
     pub summary: Option<ReplaySummary>,
@@ -230,7 +214,6 @@ pub fn verify(args: &[&OsStr]) -> Verification {
     }
 }
 
-/// Verifies a clip with the lambda in `lambda`.
 pub fn verify_clip(clip: &Path, lambda: &Path) -> Verification {
     verify(&["verify".as_ref(), clip.as_ref(), "--lambda".as_ref(), lambda.as_ref()])
 }
@@ -260,7 +243,6 @@ impl ReplayRun {
         causing.map(|at_ns| seconds(at_ns, self.start_ns())).collect()
     }
 
-    /// Label of each trigger.
     pub fn labels(&self) -> Vec<String> {
         let triggers = self.decisions.iter().flat_map(|decision| &decision.triggers);
         triggers.map(|trigger| trigger.label.clone()).collect()

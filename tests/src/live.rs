@@ -21,11 +21,8 @@ pub const PATIENCE: Duration = Duration::from_secs(90);
 /// A line that `gleaner run --json` prints.
 #[derive(Debug)]
 pub enum JsonReport {
-    /// A report of the lambda.
     Lambda(Report),
-    /// A report of the recorder.
     Recorder(RecorderReport),
-    /// A report of the ingress.
     Ingress(IngressReport),
 }
 
@@ -76,10 +73,6 @@ pub fn play(args: &[&str]) -> RunningProgram {
 
 impl RunningProgram {
     /// Starts `command`.
-    ///
-    /// # Panics
-    ///
-    /// If it cannot be started.
     pub fn start(mut command: Command) -> Self {
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
         let mut child = command.spawn().expect("the program starts");
@@ -99,10 +92,6 @@ impl RunningProgram {
     }
 
     /// Waits for the first further report for which `wanted` returns a value.
-    ///
-    /// # Panics
-    ///
-    /// If it ends earlier, or takes longer than [`PATIENCE`].
     pub fn until<T>(&self, what: &str, mut wanted: impl FnMut(JsonReport) -> Option<T>) -> T {
         self.until_line(what, |line| parsed(line).and_then(&mut wanted))
     }
@@ -175,10 +164,6 @@ impl RunningProgram {
     }
 
     /// Waits until it ends by itself; returns the rest of its reports.
-    ///
-    /// # Panics
-    ///
-    /// If it takes longer than [`PATIENCE`].
     pub fn finish(mut self) -> Finished {
         let deadline = Instant::now() + PATIENCE;
         let mut lines = Vec::new();
@@ -222,9 +207,7 @@ impl Drop for RunningProgram {
 
 /// Exit status and remaining output of a program.
 pub struct Finished {
-    /// Its exit status.
     pub status: ExitStatus,
-    /// Its reports.
     pub lines: Vec<String>,
     /// Its standard error.
     pub stderr: String,
@@ -232,10 +215,6 @@ pub struct Finished {
 
 impl Finished {
     /// The final status of the lambda.
-    ///
-    /// # Panics
-    ///
-    /// If there is none.
     pub fn ended(&self) -> LiveStatus {
         let ended = self.lines.iter().filter_map(|line| parsed(line)).find_map(|line| match line {
             JsonReport::Lambda(Report::Ended(live)) => Some(*live),
@@ -246,10 +225,6 @@ impl Finished {
     }
 
     /// The number of samples that a player has sent of each topic.
-    ///
-    /// # Panics
-    ///
-    /// If it failed, or printed no summary.
     pub fn sent(&self) -> BTreeMap<String, u64> {
         assert!(self.status.success(), "{}", self.stderr);
         let line = self.lines.last().expect("the player prints its summary");
@@ -272,10 +247,6 @@ impl Finished {
 }
 
 /// Sends a signal to one process.
-///
-/// # Panics
-///
-/// If `kill` cannot be run.
 pub fn signal(pid: u32, name: &str) {
     // It may have just ended.
     let _ = Command::new("kill")
@@ -321,10 +292,6 @@ pub fn decisions(out: &Path) -> Vec<Decision> {
 }
 
 /// The summary in a folder of results.
-///
-/// # Panics
-///
-/// If there is none.
 pub fn summary(out: &Path) -> LiveStatus {
     let text = std::fs::read(out.join("summary.json")).expect("the run has ended");
     serde_json::from_slice(&text).expect("a summary is a status")

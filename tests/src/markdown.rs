@@ -13,7 +13,6 @@ pub struct Block {
     pub lines: Vec<String>,
 }
 
-/// The fenced blocks of a page.
 pub fn blocks(page: &str) -> Vec<Block> {
     let mut blocks = Vec::new();
     let mut open: Option<(Block, usize, String)> = None;

@@ -21,10 +21,6 @@ pub fn unavailable() -> Option<&'static str> {
 }
 
 /// Returns a command that runs `program` in a new private network, which ends with it.
-///
-/// # Panics
-///
-/// If no private network can be created; see [`unavailable`].
 pub fn command(program: &Path) -> Command {
     let mut command =
         shell(unshare_options().expect("the caller has checked `unavailable`"), SET_UP);
@@ -34,10 +30,6 @@ pub fn command(program: &Path) -> Command {
 
 /// Returns a command that runs this program again in a private network, with the environment
 /// variable `name` set to `value` to select its work.
-///
-/// # Panics
-///
-/// As [`command`].
 pub fn rerun(name: &str, value: &str) -> Command {
     let mut command = command(&std::env::current_exe().expect("a program has a path"));
     command.env(name, value);
@@ -46,14 +38,6 @@ pub fn rerun(name: &str, value: &str) -> Command {
 
 /// Runs a case of a test suite in a private network: runs this program again with the environment
 /// variable `name` set to `case`, and prints its output.
-///
-/// # Errors
-///
-/// The exit status and standard error of the case, if it failed.
-///
-/// # Panics
-///
-/// As [`command`].
 pub fn case(name: &str, case: &str) -> Result<(), Failed> {
     let output = rerun(name, case).stdin(Stdio::null()).output()?;
     print!("{}", String::from_utf8_lossy(&output.stdout));

@@ -10,32 +10,23 @@ use gleaner_lambda::Clip;
 use mcap::records::{MessageHeader, Metadata, Record};
 use mcap::{Attachment, Channel};
 
-/// An attachment.
 #[derive(Clone)]
 pub struct ClipAttachment {
-    /// Its name.
     pub name: String,
-    /// Its media type.
     pub media_type: String,
-    /// Its log time.
     pub log_time: u64,
-    /// Its content.
     pub data: Vec<u8>,
 }
 
 /// A message, with the index of its channel.
 pub type ClipMessage = (usize, MessageHeader, Vec<u8>);
 
-/// The parts of a clip.
 #[derive(Clone)]
 pub struct ClipParts {
-    /// Its metadata records.
     pub metadata: Vec<Metadata>,
-    /// Its channels.
     pub channels: Vec<Arc<Channel<'static>>>,
     /// Its messages, each with the index of its channel.
     pub messages: Vec<ClipMessage>,
-    /// Its attachments.
     pub attachments: Vec<ClipAttachment>,
 }
 
@@ -128,14 +119,12 @@ impl ClipParts {
         &mut record.unwrap_or_else(|| panic!("no record gleaner.{name}")).metadata
     }
 
-    /// The record of a topic.
     pub fn topic(&mut self, topic: &str) -> &mut BTreeMap<String, String> {
         let is_it =
             |metadata: &&mut Metadata| metadata.metadata.get("topic").is_some_and(|of| of == topic);
         &mut self.metadata.iter_mut().find(is_it).unwrap().metadata
     }
 
-    /// Changes the line of the clip in its record.
     pub fn change_line(&mut self, change: impl FnOnce(&mut Clip)) {
         let record = self.record("clip");
         let mut line = serde_json::from_str(&record["line"]).unwrap();
@@ -143,24 +132,20 @@ impl ClipParts {
         record.insert("line".to_owned(), serde_json::to_string(&line).unwrap());
     }
 
-    /// The index of a channel of the topic.
     pub fn channel_of(&self, topic: &str) -> usize {
         self.channels.iter().position(|channel| channel.topic == topic).unwrap()
     }
 
-    /// The messages of a topic.
     pub fn messages_of(&mut self, topic: &str) -> Vec<&mut ClipMessage> {
         let channels: Vec<_> = self.channels.iter().map(|channel| channel.topic == topic).collect();
         self.messages.iter_mut().filter(|(channel, ..)| channels[*channel]).collect()
     }
 
-    /// Drops the messages of a topic.
     pub fn drop_messages_of(&mut self, topic: &str) {
         let channels: Vec<_> = self.channels.iter().map(|channel| channel.topic == topic).collect();
         self.messages.retain(|(channel, ..)| !channels[*channel]);
     }
 
-    /// The journal excerpt in it.
     pub fn journal(&mut self) -> &mut ClipAttachment {
         self.attachments
             .iter_mut()

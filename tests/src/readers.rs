@@ -6,10 +6,6 @@ use std::process::Command;
 use crate::root;
 
 /// The Python of `cargo xtask test`, if it has the readers.
-///
-/// # Errors
-///
-/// The reason, for the name of an ignored test.
 pub fn foreign_python() -> Result<PathBuf, String> {
     let python = root().join(".venv/bin/python3");
     let has = Command::new(&python).args(["-I", "-c", "import mcap, mcap_ros2, rosbags"]).output();
@@ -21,10 +17,6 @@ pub fn foreign_python() -> Result<PathBuf, String> {
 
 /// Compares the clips that `out` lists with the drives of their run, as `tests/readers/clips.py`
 /// describes. Does nothing without the readers: tests of `drives` are ignored then.
-///
-/// # Panics
-///
-/// If a clip differs, or there is none.
 #[track_caller]
 pub fn compare_clips(out: &Path, drives: &[PathBuf]) {
     let Ok(python) = foreign_python() else { return };

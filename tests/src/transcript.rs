@@ -4,7 +4,7 @@
 use std::path::Path;
 use std::process::{Command, Stdio};
 
-use gleaner_parts::Parts;
+use gleaner_base::programs::InstalledPrograms;
 
 use crate::markdown::{Block, blocks};
 use crate::{program, root};
@@ -14,7 +14,6 @@ use crate::{program, root};
 pub struct TranscriptStep {
     /// Line of the block's fence, from 1.
     pub line: usize,
-    /// The command, for a shell.
     pub command: String,
     /// Lines of the output; `[..]` stands for any text within a line, and a line `...` for any
     /// lines.
@@ -46,15 +45,11 @@ pub fn steps(page: &str) -> Vec<TranscriptStep> {
 
 /// Runs `command` in `folder`; returns its output on both streams, and its exit code unless it is
 /// 0. Paths within the folder become relative to it.
-///
-/// # Panics
-///
-/// If there is no shell or no Python.
 pub fn perform(folder: &Path, command: &str) -> Vec<String> {
     let gleaner = program("gleaner");
     let programs = gleaner.parent().expect("a program lies in a folder");
     let path = std::env::var_os("PATH").unwrap_or_default();
-    let python = Parts::find().and_then(|parts| parts.python(None)).expect("a Python");
+    let python = InstalledPrograms::find().and_then(|parts| parts.python(None)).expect("a Python");
     let first =
         [programs, python.parent().expect("a program lies in a folder")].map(Path::to_owned);
     let path = std::env::join_paths(first.into_iter().chain(std::env::split_paths(&path)));

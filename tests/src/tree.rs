@@ -10,7 +10,6 @@ use crate::root;
 pub struct File {
     /// Its path from the root of the checkout, with `/` between its parts.
     pub path: String,
-    /// Its content.
     pub text: String,
 }
 
@@ -25,10 +24,6 @@ impl File {
 
 /// All text files of the checkout, sorted by path. Generated ones are omitted: target folders,
 /// results, build folders of lambdas, and hidden folders except the project's own.
-///
-/// # Panics
-///
-/// If the checkout cannot be read.
 pub fn files() -> Vec<File> {
     let root = root();
     let mut files = Vec::new();

@@ -35,17 +35,12 @@ impl TestVehicle {
     }
 
     /// As [`new`](Self::new), with an orchestrator.
-    ///
-    /// # Panics
-    ///
-    /// If it does not start.
     pub fn started() -> Self {
         let mut vehicle = Self::new();
         vehicle.start();
         vehicle
     }
 
-    /// Returns a path in its folder.
     pub fn path(&self, name: &str) -> PathBuf {
         self.folder.path().join(name)
     }
@@ -58,10 +53,6 @@ impl TestVehicle {
 
     /// Starts the orchestrator, and waits until it answers. Installs the trust root if there is
     /// none.
-    ///
-    /// # Panics
-    ///
-    /// If it does not start.
     pub fn start(&mut self) {
         let log = self.path("orchestrator.log");
         let log = std::fs::File::options().create(true).append(true).open(log);
@@ -86,19 +77,11 @@ impl TestVehicle {
     }
 
     /// Returns the process id of the orchestrator.
-    ///
-    /// # Panics
-    ///
-    /// If it does not run.
     pub fn orchestrator(&self) -> u32 {
         self.orchestrator.as_ref().expect("it runs").id()
     }
 
     /// Returns the process id of the supervisor, after waiting for its start.
-    ///
-    /// # Panics
-    ///
-    /// If there is none.
     pub fn supervisor(&self) -> u32 {
         self.until("a supervisor", |vehicle| {
             let text = std::fs::read_to_string(vehicle.path("state/supervisor.lock"));
@@ -130,10 +113,6 @@ impl TestVehicle {
     }
 
     /// Ends the orchestrator by SIGTERM, and with it all processes.
-    ///
-    /// # Panics
-    ///
-    /// If it does not end with success.
     pub fn stop(&mut self) {
         let Some(mut orchestrator) = self.orchestrator.take() else { return };
         signal(orchestrator.id(), "TERM");
@@ -157,10 +136,6 @@ impl TestVehicle {
     }
 
     /// Publishes and deploys a build.
-    ///
-    /// # Panics
-    ///
-    /// If it fails.
     pub fn deploys(&self, lambda: &Path) {
         let deployed = self.deploy(lambda, &[]);
         assert!(deployed.status.success(), "{}", text(&deployed));
@@ -174,10 +149,6 @@ impl TestVehicle {
     }
 
     /// Runs `gleaner` with these arguments; returns its standard output.
-    ///
-    /// # Panics
-    ///
-    /// If it fails.
     pub fn succeeds(&self, args: &[&str]) -> String {
         let output = self.gleaner(args);
         assert!(output.status.success(), "{args:?}: {}\n{}", text(&output), self.log());
@@ -185,10 +156,6 @@ impl TestVehicle {
     }
 
     /// Returns the status of the vehicle.
-    ///
-    /// # Panics
-    ///
-    /// If the orchestrator does not answer.
     pub fn status(&self) -> VehicleStatus {
         self.try_status().unwrap_or_else(|| panic!("no status: {}", self.log()))
     }
@@ -200,10 +167,6 @@ impl TestVehicle {
     }
 
     /// Returns the status of a deployment.
-    ///
-    /// # Panics
-    ///
-    /// If there is none.
     pub fn deployment(&self, id: &str) -> DeploymentStatus {
         let deployments = self.status().deployments;
         deployments.into_iter().find(|it| it.id == id).expect("it is deployed")
@@ -218,7 +181,6 @@ impl TestVehicle {
         started.elapsed()
     }
 
-    /// Returns whether these deployments run.
     pub fn all_run(status: &VehicleStatus, ids: &[&str]) -> bool {
         let runs = |id: &&str| {
             let of_id = status.deployments.iter().find(|it| it.id == **id);
@@ -238,10 +200,6 @@ impl TestVehicle {
     }
 
     /// Waits until `wanted` returns a value.
-    ///
-    /// # Panics
-    ///
-    /// If it takes longer than [`PATIENCE`].
     pub fn until<T>(&self, what: &str, mut wanted: impl FnMut(&Self) -> Option<T>) -> T {
         let deadline = Instant::now() + PATIENCE;
         loop {
@@ -273,7 +231,6 @@ impl Drop for TestVehicle {
     }
 }
 
-/// Returns the output of a program as text.
 pub fn text(output: &Output) -> String {
     let [out, error] = [&output.stdout, &output.stderr].map(|it| String::from_utf8_lossy(it));
     format!("{}\n{out}{error}", output.status)

@@ -1,5 +1,5 @@
-//! Counts openings without a subject and discouraged words in comments and pages. See
-//! CONTRIBUTING.md.
+//! Counts openings without a subject and discouraged words in comments, pages and the texts of
+//! programs. See CONTRIBUTING.md.
 
 /// The kind of text that a finding lies in. Each kind has an allowance of its own.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -13,6 +13,8 @@ pub enum Kind {
     PrivateOpening,
     /// A comment, documentation or a page has a discouraged word.
     Word,
+    /// A text that a program prints has a discouraged word or phrase.
+    Text,
 }
 
 /// A place that should be worded in another way.
@@ -79,6 +81,63 @@ const WORDS: &[&str] = &[
     "ours", "said", "say", "saying", "says", "somebody", "tell", "telling", "tells", "theirs",
     "told", "whoever",
 ];
+
+/// Phrases that stand for a thing, where a reader without context needs its name: "is no address",
+/// "a digest is none". After `there`, they are right, and so is `is none of`.
+const PHRASES: &[&str] = &[" is no ", " are no ", " is none", " are none", " any more", " for now"];
+
+/// The texts of a Rust file, each with its line, from 1. In them, `there is` and `none of` are one
+/// word.
+fn texts(text: &str) -> Vec<(usize, String)> {
+    let mut texts = Vec::new();
+    let mut rest = text;
+    while let Some(at) = rest.find(['"', '\'', '/']) {
+        let begin = &rest[at..];
+        // A character or a lifetime, a comment, a raw text, another text.
+        let length = match begin.as_bytes() {
+            [b'\'', b'\\', _, rest @ ..] => {
+                rest.iter().position(|byte| *byte == b'\'').map_or(3, |end| end + 4)
+            }
+            [b'\'', b'"' | b'/', b'\'', ..] => 3,
+            [b'/', b'/', ..] => begin.find('\n').unwrap_or(begin.len()),
+            [b'"', ..] if rest[..at].ends_with('#') => {
+                let hashes = rest[..at].len() - rest[..at].trim_end_matches('#').len();
+                begin.find(&format!("\"{}", "#".repeat(hashes))).map_or(begin.len(), |end| end + 1)
+            }
+            [b'"', ..] => {
+                let mut is_escaped = true;
+                let end = begin.find(|c| {
+                    let ends = c == '"' && !is_escaped;
+                    is_escaped = c == '\\' && !is_escaped;
+                    ends
+                });
+                end.map_or(begin.len(), |end| end + 1)
+            }
+            _ => 1,
+        };
+        if begin.starts_with('"') {
+            let line = text[..text.len() - begin.len()].lines().count().max(1);
+            let found = begin[1..length].replace("here ", "here-").replace("no longer", "-");
+            let found = found.replace("none of", "-");
+            texts.push((line, format!(" {found} ")));
+        }
+        rest = &begin[length.max(1)..];
+    }
+    texts
+}
+
+/// The discouraged words and phrases of the texts of a program in Rust.
+pub fn findings_in_texts(text: &str) -> Vec<Finding> {
+    let product = text.split("\nmod tests {").next().unwrap_or_default();
+    let mut found = Vec::new();
+    for (line, text) in texts(product) {
+        let phrases = PHRASES.iter().copied().filter(|phrase| text.contains(phrase));
+        for what in words(&text).into_iter().chain(phrases) {
+            found.push(Finding { kind: Kind::Text, line, what: what.to_owned() });
+        }
+    }
+    found
+}
 
 /// The places of a file that should be worded in another way, in the order of its lines.
 ///

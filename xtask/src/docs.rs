@@ -46,7 +46,8 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     build.arg("build").arg(&source).arg("--dest-dir").arg(&book);
     steps::run(
         &mut build,
-        "see the error above; `cargo test --release -p gleaner-tests --test house docs` checks the links",
+        "see the error above; `cargo test --release -p gleaner-tests --test architecture docs` \
+         checks the links",
     )?;
     println!("built {}", book.join("index.html").display());
     Ok(Exit::Ok)

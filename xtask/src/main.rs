@@ -29,9 +29,6 @@ mod revisions;
 mod setup;
 mod steps;
 mod suites;
-#[cfg(test)]
-#[path = "../../base/src/test_folder.rs"]
-mod test_folder;
 mod venv;
 
 use std::env;

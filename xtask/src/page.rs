@@ -15,7 +15,7 @@ const BROWSER: &str = "/usr/bin/chromium";
 /// Packages of npm, with their versions: the driver of the browser, and the check of accessibility.
 const MODULES: [&str; 2] = ["playwright-core@1.65.1", "axe-core@4.14.1"];
 
-/// Runs the flows of `cloud/server/tests/page`.
+/// Runs the flows of `cloud/tests/page`.
 pub(crate) fn run_flows(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
     let is_installing = steps::has_flag("page", "--install", arguments)?;
     let folder = checkout.target().join("page");
@@ -30,7 +30,7 @@ pub(crate) fn run_flows(checkout: &Checkout, arguments: &[OsString]) -> Result<E
     run(&mut build, "see the first error above")?;
     steps.begin("flows");
     let mut node = checkout.command("node");
-    node.arg(checkout.path("cloud/server/tests/page/flows.mjs"));
+    node.arg(checkout.path("cloud/tests/page/flows.mjs"));
     node.arg(folder.join("node_modules")).arg(checkout.program("examples/page_fleet"));
     node.arg(BROWSER).arg(folder.join("screenshots"));
     let help = format!("screenshots are in `{}`", folder.join("screenshots").display());

@@ -26,7 +26,7 @@ mod tests {
     use std::process::Output;
 
     use super::*;
-    use crate::test_folder::TestFolder;
+    use gleaner_test_support::TestFolder;
 
     /// Takes the place of cargo: the results are the content of `value` in the checkout. Each call
     /// is a line of `calls`, next to this file. A Python that is named has to exist.

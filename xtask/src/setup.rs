@@ -38,9 +38,12 @@ pub(crate) const PROGRAMS: [&str; 11] = [
     "gleaner-orchestrator",
     "gleaner-python",
     "gleaner-recorder",
-    "gleaner-shim",
+    "gleaner-sandbox",
     "gleaner-supervisor",
 ];
+
+/// Features of the programs that cargo does not select by default.
+pub(crate) const SCALED: &str = "--features=gleaner-cloud/scaled";
 
 /// Sets up the wasm target, `.venv`, all programs, and these lambdas.
 pub(crate) fn run(
@@ -115,6 +118,9 @@ fn build(checkout: &Checkout, packages: &[&str], programs: &[&str]) -> Result<()
     build
         .args(["build", "--release"])
         .args(packages.iter().flat_map(|package| ["--package", package]));
+    if packages.contains(&"gleaner-cloud") {
+        build.arg(SCALED);
+    }
     for program in programs {
         if program.starts_with("--") {
             build.arg(program)
@@ -135,12 +141,12 @@ pub(crate) fn binaries(checkout: &Checkout, names: &[&str]) -> Result<(), Failur
     build(checkout, &[], names)
 }
 
-/// Returns the command that tests the bindings of the Rust SDK, which a test in `tests/bindings`
+/// Returns the command that tests the bindings of the Rust SDK, which a test in `test-support`
 /// generates and compares; with `GLEANER_BLESS` it writes them.
 pub(crate) fn test_bindings(checkout: &Checkout) -> Command {
     let mut test = checkout.cargo();
     // The generator runs for a second, so it is not optimized.
-    test.args(["test", "--profile", "xtask", "--package", "gleaner-bindings"]);
+    test.args(["test", "--profile", "xtask", "--package", "gleaner-test-support"]);
     test.args(["--features", "generator"]);
     test
 }

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use gleaner_base::Failure;
-use gleaner_parts::Parts;
+use gleaner_base::programs::InstalledPrograms;
 
 use crate::checkout::Checkout;
 use crate::steps::{self, cannot, download, run, succeeds};
@@ -94,7 +94,7 @@ fn has_pip(checkout: &Checkout, folder: &Path) -> bool {
 fn make(checkout: &Checkout, folder: &Path) -> Result<(), Failure> {
     steps::remove_folder(folder)?;
     // Found as for a lambda: that of `.venv` comes first, unless it is what is made again.
-    let interpreter = Parts::find()?.python(None)?;
+    let interpreter = InstalledPrograms::find()?.python(None)?;
     println!("created by {}", interpreter.display());
     let mut make = checkout.command(interpreter);
     make.args(["-m", "venv"]).arg(folder);
@@ -127,7 +127,7 @@ pub(crate) fn pip(mut python: Command, packages: &[&str], help: &str) -> Result<
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::test_folder::TestFolder;
+    use gleaner_test_support::TestFolder;
 
     #[test]
     fn an_environment_of_other_versions_is_made_again() {

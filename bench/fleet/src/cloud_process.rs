@@ -29,7 +29,7 @@ impl CloudProcess {
         let own = std::env::current_exe().map_err(|error| error.to_string())?;
         let program = own.with_file_name("gleaner-cloud");
         let mut child = Command::new(&program)
-            .args(["serve", "--people", &people.to_string(), "--vehicles", &vehicles.to_string()])
+            .args(["serve", "--http", &people.to_string(), "--vehicles", &vehicles.to_string()])
             .arg("--data")
             .arg(folder)
             .stdout(Stdio::piped())

@@ -112,7 +112,7 @@ impl SimulatedIdentity {
         connector.connect(name, stream).await.map_err(failed)
     }
 
-    /// Fetches what is under a path, over a connection that lasts for all files of a wanted state.
+    /// Fetches what is under a path, over a connection that lasts for all files of a desired state.
     pub async fn get(
         &self,
         files: &mut Option<SendRequest<Full<Bytes>>>,

@@ -47,7 +47,7 @@ pub struct SimulatedVehicle {
     waiting: Option<(u64, Instant)>,
     /// Each deployment that runs: id, envelope, release and digest of its revision.
     runs: Vec<RunningRelease>,
-    /// Numbers of the last wanted state, and of the one that was applied.
+    /// Numbers of the last desired state, and of the one that was applied.
     received: u64,
     handled: u64,
 }
@@ -189,7 +189,7 @@ impl SimulatedVehicle {
         Ok(None)
     }
 
-    /// Fetches the deployments of a wanted state that are new, over one connection as real vehicles
+    /// Fetches the deployments of a desired state that are new, over one connection as real ones
     /// do, and reports that they run. Nothing is verified and nothing starts.
     async fn apply(&mut self, socket: &mut Socket, desired: Desired) -> Result<(), String> {
         let simulation = Arc::clone(&self.simulation);
@@ -197,7 +197,7 @@ impl SimulatedVehicle {
         if generation < self.received {
             let Self { identity, received, .. } = self;
             simulation
-                .error(format!("{}: wanted state {generation} after {received}", identity.name));
+                .error(format!("{}: desired state {generation} after {received}", identity.name));
         }
         self.received = generation;
         let wanted: Vec<_> = deployments.into_iter().filter(|it| it.is_wanted).collect();

@@ -8,12 +8,12 @@ use bench_kernels::Work;
 use divan::counter::BytesCount;
 use divan::{Bencher, black_box};
 use gleaner_buffers::shared::{
-    ControlPage, HoldLimits, META_WORDS, SharedLayout, SharedReader, SharedWriter, in_process,
+    ControlPage, META_WORDS, PinLimits, SharedLayout, SharedReader, SharedWriter, in_process,
 };
 use gleaner_buffers::{HeapRegion, Pool, RingReader, RingWriter, ring};
 use gleaner_messages::{Definitions, Endian, FieldPath};
+use gleaner_pixels::vision::{DetectorLayout, OutputView, Placed, Preparer, Wanted, detect};
 use gleaner_rules::pixels::{Encoding, View};
-use gleaner_vision::{DetectorLayout, OutputView, Placed, Preparer, Wanted, detect};
 
 /// Bytes of an IMU sample.
 const IMU: usize = 324;
@@ -45,7 +45,7 @@ fn publish_own(writer: &mut RingWriter<u64>, value: u64) {
 
 /// A ring in shared memory, as the ingress has it, with samples of an IMU.
 fn shared_ring() -> (SharedWriter, SharedReader) {
-    let limits = HoldLimits { first_word: 0, windows: 2, window: WINDOW as u16, singles: 2 };
+    let limits = PinLimits { first_word: 0, windows: 2, window: WINDOW as u16, singles: 2 };
     let depth = 512;
     let layout = SharedLayout { depth, slots: depth + limits.quota() + 1, slot_bytes: IMU as u64 };
     let (memory, reading) = in_process(layout).expect("a ring");

@@ -22,9 +22,6 @@ mod recommendation;
 mod results;
 mod sequence;
 mod statistics;
-#[cfg(test)]
-#[path = "../../../base/src/test_folder.rs"]
-mod test_folder;
 
 pub use comparison::Comparison;
 pub use core_list::CoreList;

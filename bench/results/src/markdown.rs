@@ -10,7 +10,7 @@ use crate::statistics::{MeasuredDifference, Summary};
 pub(crate) const STATISTICS: [&str; 7] = ["min", "mean", "median", "MAD", "p95", "p99", "max"];
 /// Heads of a comparison.
 pub(crate) const COMPARED: [&str; 4] =
-    ["median, times", "95 % interval", "effect (Cliff's delta)", "p (Mann-Whitney U)"];
+    ["median ratio", "95 % interval", "effect (Cliff's delta)", "p (Mann-Whitney U)"];
 
 impl BenchResults {
     /// Returns the tables, with the machine and the notes.
@@ -58,7 +58,7 @@ impl BenchResults {
 
     /// Returns a title for people.
     pub(crate) fn title(&self) -> String {
-        let quick = if self.is_quick { ", a short run that shows only that it works" } else { "" };
+        let quick = if self.is_quick { " (smoke test: values are not meaningful)" } else { "" };
         format!("Gleaner bench: {}{quick}", self.bench)
     }
 }

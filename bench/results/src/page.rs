@@ -74,7 +74,7 @@ impl SeriesGroup {
         let curves = self.series.iter().filter(|series| !series.values.is_empty());
         let plot = Plot {
             x: self.unit.clone(),
-            y: "share of values up to this".to_owned(),
+            y: "cumulative fraction".to_owned(),
             is_x_logarithmic: true,
             curves: curves
                 .map(|series| PlotCurve { name: series.name.clone(), points: ecdf(series) })

@@ -144,7 +144,7 @@ fn number(file: &Path) -> Option<u64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::test_folder::TestFolder;
+    use gleaner_test_support::TestFolder;
 
     #[test]
     fn power_is_read_from_counters_and_rails() {

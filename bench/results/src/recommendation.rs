@@ -6,12 +6,12 @@ use crate::statistics::MeasuredDifference;
 /// Least ratio that counts as a difference between the kinds: less depends on the machine.
 const FACTOR: f64 = 1.25;
 /// Least differences that a user could notice, in the units of the costs.
-const LEAST_US: f64 = 1.0;
-const LEAST_MB: f64 = 1.0;
-const LEAST_CALL_NS: f64 = 1000.0;
-const LEAST_START_MS: f64 = 10.0;
-const LEAST_RESTARTED_MS: f64 = 1.0;
-const LEAST_KILLED_S: f64 = 0.1;
+const MIN_US: f64 = 1.0;
+const MIN_MB: f64 = 1.0;
+const MIN_CALL_NS: f64 = 1000.0;
+const MIN_START_MS: f64 = 10.0;
+const MIN_RESTARTED_MS: f64 = 1.0;
+const MIN_KILLED_S: f64 = 0.1;
 
 /// Costs of isolation. What was not measured is `None`, and is left out of the recommendation.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -106,15 +106,15 @@ impl IsolationCosts {
 
     /// Returns when to take which kind.
     fn rules(&self) -> Vec<String> {
-        let wakes = self.wakes.iter().map(|wake| (wake.name.as_str(), wake.us, LEAST_US));
-        let live = self.live_cpu_us.iter().map(|(name, us)| (name.as_str(), *us, LEAST_US));
+        let wakes = self.wakes.iter().map(|wake| (wake.name.as_str(), wake.us, MIN_US));
+        let live = self.live_cpu_us.iter().map(|(name, us)| (name.as_str(), *us, MIN_US));
         let others = [
-            ("host calls", self.host_call_ns, LEAST_CALL_NS),
-            ("memory of the first lambda", self.first_lambda_mb, LEAST_MB),
-            ("memory", self.further_lambda_mb, LEAST_MB),
-            ("starts", self.start_ms, LEAST_START_MS),
-            ("recovery from a fault", self.restarted_ms, LEAST_RESTARTED_MS),
-            ("recovery from a kill", self.killed_s, LEAST_KILLED_S),
+            ("host calls", self.host_call_ns, MIN_CALL_NS),
+            ("memory of the first lambda", self.first_lambda_mb, MIN_MB),
+            ("memory", self.further_lambda_mb, MIN_MB),
+            ("starts", self.start_ms, MIN_START_MS),
+            ("recovery from a fault", self.restarted_ms, MIN_RESTARTED_MS),
+            ("recovery from a kill", self.killed_s, MIN_KILLED_S),
         ];
         let all = wakes.chain(live).chain(others);
         let criteria: Vec<Criterion<'_>> = all

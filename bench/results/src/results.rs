@@ -21,7 +21,7 @@ pub struct BenchResults {
     format: u32,
     /// The benchmark, as in `cargo xtask bench NAME`.
     pub bench: String,
-    /// True if it ran for a short time: the values show only that it works.
+    /// True for a smoke test: its values are not meaningful.
     pub is_quick: bool,
     /// The machine on which it ran.
     pub machine: Machine,
@@ -230,7 +230,7 @@ impl SeriesGroup {
 pub(crate) mod tests {
     use super::*;
     use crate::growth::GrowthCurve;
-    use crate::test_folder::TestFolder;
+    use gleaner_test_support::TestFolder;
 
     /// Results with a table and a comparison; `shift` is added to the times of wasm.
     pub(crate) fn example(shift: f64) -> BenchResults {

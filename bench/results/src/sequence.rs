@@ -114,7 +114,7 @@ impl SequenceEntry {
 mod tests {
     use super::*;
     use crate::figure::Figure;
-    use crate::test_folder::TestFolder;
+    use gleaner_test_support::TestFolder;
 
     #[test]
     fn results_count_whatever_the_exit_code_is() {

@@ -5,7 +5,7 @@ use std::io::Write;
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
-use gleaner_tests::random::XorShift64;
+use gleaner_test_support::random::XorShift64;
 
 /// Width of a frame in pixels.
 pub(super) const WIDTH: u32 = 1920;

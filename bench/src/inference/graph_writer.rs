@@ -1,6 +1,6 @@
 //! Writes graphs of convolutions with random weights, as ONNX files.
 
-use super::onnx::{self, FLOAT32, INT64, Proto, node};
+use gleaner_test_support::onnx::{self, FLOAT32, INT64, Proto, node};
 
 /// A graph that grows node by node.
 pub(super) struct GraphWriter {
@@ -190,7 +190,7 @@ impl GraphWriter {
         self.split(&from.name, 1, [channels; 2]).map(|name| Picture { name, channels, ..*from })
     }
 
-    /// Returns the largest values of squares of 5x5.
+    /// Appends a max-pooling node of 5x5.
     pub(super) fn max_pool(&mut self, from: &Picture) -> Picture {
         let attributes = [
             integers("kernel_shape", &[5; 2]),

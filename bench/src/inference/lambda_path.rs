@@ -6,13 +6,13 @@ use std::os::fd::OwnedFd;
 use std::os::unix::fs::FileExt;
 use std::time::{Duration, Instant};
 
+use gleaner_pixels::vision::{
+    Detection, DetectorLayout, OutputView, Placed, Preparer, Preprocess, Wanted, detect,
+};
 use gleaner_protocol::inference::{
     ModelCall, ModelClient, ModelResult, ModelWait, TensorInfo, TensorPlace,
 };
 use gleaner_rules::pixels::{Encoding, View};
-use gleaner_vision::{
-    Detection, DetectorLayout, OutputView, Placed, Preparer, Preprocess, Wanted, detect,
-};
 use rustix::time::{ClockId, clock_gettime};
 use zerocopy::IntoBytes;
 

@@ -11,13 +11,11 @@ mod frames;
 mod graph_writer;
 mod lambda_path;
 mod model_process;
-#[path = "../../../host/inference/tests/suite/onnx.rs"]
-mod onnx;
 mod python_program;
 mod yolo_graph;
 
+use gleaner_pixels::vision::DetectorLayout;
 use gleaner_tests::{TempFolder, root};
-use gleaner_vision::DetectorLayout;
 
 use crate::measure::{peak_mib, pss_mib};
 use frames::FrameFile;

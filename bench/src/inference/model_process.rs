@@ -18,7 +18,7 @@ use sha2::{Digest, Sha256};
 /// A model of a measurement.
 pub(super) struct BenchModel {
     pub(super) name: &'static str,
-    pub(super) layout: gleaner_vision::DetectorLayout,
+    pub(super) layout: gleaner_pixels::vision::DetectorLayout,
     pub(super) path: std::path::PathBuf,
     pub(super) sha256: String,
     pub(super) frames: usize,

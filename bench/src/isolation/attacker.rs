@@ -5,10 +5,10 @@ use std::fmt;
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
+use gleaner_messages::transport::Clock;
 use gleaner_protocol::LiveStatus;
 use gleaner_tests::live::{RunningProgram, run};
 use gleaner_tests::{LambdaCopy, TempFolder};
-use gleaner_transport::Clock;
 
 use super::blocks::{BLOCK_MS, BlockSchedule};
 use crate::measure::{Twin, bind_to};

@@ -14,8 +14,8 @@ mod victim;
 use clap::Args;
 use gleaner_bench_results::{AttackCounts, BenchResults, Figure, Goal, KindValues};
 use gleaner_dds::{Dds, DdsOptions};
+use gleaner_messages::transport::{Clock, LiveSource};
 use gleaner_tests::live::play;
-use gleaner_transport::{Clock, LiveSource};
 
 use self::attacker::{ATTACKS, Attacker};
 use self::blocks::BlockSchedule;

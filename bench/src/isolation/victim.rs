@@ -4,9 +4,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use gleaner_dds::Dds;
+use gleaner_messages::transport::Clock;
 use gleaner_tests::TempFolder;
 use gleaner_tests::live::{PATIENCE, RunningProgram, run};
-use gleaner_transport::Clock;
 
 use super::RATE_HZ;
 use super::attacker::Attack;

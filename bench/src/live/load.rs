@@ -1,5 +1,5 @@
-//! Lambdas that one `gleaner run` runs over one ingress while players publish: what each process
-//! receives and costs.
+//! Load test: some lambdas in one `gleaner run`, while players publish. It measures what each
+//! process receives and costs.
 
 use std::collections::BTreeMap;
 use std::path::Path;

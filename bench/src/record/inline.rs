@@ -6,13 +6,13 @@ use std::time::{Duration, Instant};
 
 use gleaner_journal::JournalEntry;
 use gleaner_lambda::manifest::{Manifest, Store};
+use gleaner_messages::transport::loopback::Loopback;
+use gleaner_messages::transport::{Delivery, SampleMeta, Sink, TopicSpec, Transport};
+use gleaner_protocol::process_stats::usage;
 use gleaner_recorder::{
     LambdaSpec, Recorder, RecordingFolder as Clips, Settings, TopicId, TopicSchema,
 };
 use gleaner_tests::TempFolder;
-use gleaner_transport::loopback::Loopback;
-use gleaner_transport::{Delivery, SampleMeta, Sink, TopicSpec, Transport};
-use gleaner_vitals::usage;
 
 use super::{FRAMES_PER_S, TYPE, Traffic, header};
 

@@ -12,7 +12,7 @@ use gleaner_bench_results::{Figure, quantile};
 use gleaner_journal::{JournalEntry, JournalHeader};
 use gleaner_lambda::manifest::Store;
 use gleaner_lambda::{Trigger, TriggerKind};
-use gleaner_transport::{Guid, SampleMeta};
+use gleaner_messages::transport::{Guid, SampleMeta};
 
 use inline::record;
 use process::record_live;

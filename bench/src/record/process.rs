@@ -14,15 +14,14 @@ use gleaner_ingress::Ingress;
 use gleaner_journal::{FileDigest, JournalHeader};
 use gleaner_lambda::manifest::Limits;
 use gleaner_messages::Sources;
-use gleaner_protocol::ingress::{AddReader, Qos};
+use gleaner_messages::transport::Clock;
+use gleaner_messages::transport::loopback::Loopback;
+use gleaner_protocol::ingress::{AddReader, Qos, recorded_grant};
 use gleaner_protocol::link::{
     AddLambda, ControlClient, RecorderLink, RecorderMessage, RecorderReport, RecorderStatus,
-    recorded_grant,
 };
 use gleaner_recorder::program::{RecorderConnections, RecorderOptions, run};
 use gleaner_tests::TempFolder;
-use gleaner_transport::Clock;
-use gleaner_transport::loopback::Loopback;
 use sha2::{Digest, Sha256};
 
 use super::{FRAMES_PER_S, TYPE, Traffic, header, wake};

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use gleaner_messages::CdrWriter;
-use gleaner_transport::Clock;
+use gleaner_messages::transport::Clock;
 use mio::{Events, Interest, Poll, Token};
 use rustdds::policy::{Durability, History, Reliability, ResourceLimits};
 use rustdds::{

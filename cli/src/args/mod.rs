@@ -90,7 +90,7 @@ pub enum CliCommand {
     /// Create or show a key that signs revisions, deployments and clips
     #[command(subcommand)]
     Keys(KeysCommand),
-    /// Sign a built lambda: write its revision, by which a vehicle can recognise its files
+    /// Sign a built lambda: write `revision.json`, the signed list of its files
     Publish(PublishArgs),
     /// Sign or install a trust root: the keys that a vehicle accepts
     #[command(subcommand)]
@@ -248,7 +248,7 @@ pub struct RunArgs {
     pub bytes_max: Option<u64>,
     #[command(flatten)]
     pub sign: SignArgs,
-    /// Receive with real-time priority, where the system permits it; see docs/live.md
+    /// Receive with real-time priority, where the system permits it; see docs/live-network.md
     #[arg(long, conflicts_with = "drive")]
     pub real_time: bool,
     /// Create a control group for each lambda's process in this cgroup v2 folder, which must be

@@ -75,7 +75,7 @@ fn a_deployment_is_for_this_machine_or_for_a_fleet() {
 #[test]
 fn arguments_for_a_cloud_are_checked_before_any_request() {
     for (line, message) in [
-        (&["users", "invite", "ada", "--role", "root"][..], "viewer, operator, deployer and admin"),
+        (&["users", "invite", "ada", "--role", "root"][..], "viewer, operator, deployer or admin"),
         (&["users", "invite", "ada"], "--role"),
         (&["users", "remove", "a/b"], "as in ada"),
         (&["vehicles", "revoke", "a b"], "as in car-7"),

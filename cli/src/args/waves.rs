@@ -74,9 +74,9 @@ pub struct FleetArgs {
 /// Commands of `gleaner fleet`.
 #[derive(Subcommand, Debug)]
 pub enum FleetCommand {
-    /// Let no more waves of a deployment open for now
+    /// Pause the waves of a deployment: no further one opens
     Pause(FleetIdArgs),
-    /// Let the waves of a deployment go on; failures so far do not count any more
+    /// Resume the waves of a deployment; its failure count is reset
     Resume(FleetIdArgs),
     /// End the waves of a deployment: vehicles that have it keep it, and no others get it
     Abort(FleetIdArgs),
@@ -92,7 +92,6 @@ pub struct FleetIdArgs {
 
 fn percent(text: &str) -> Result<u8, String> {
     let number = text.strip_suffix('%').unwrap_or(text).parse::<u8>().ok();
-    let refused =
-        || format!("`{}` is no share: write a percentage, as in 5%", gleaner_base::excerpt(text));
+    let refused = || format!("`{}` is not a percentage, as in 5%", gleaner_base::excerpt(text));
     number.filter(|number| *number <= 100).ok_or_else(refused)
 }

@@ -4,12 +4,12 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::process::ExitStatus;
 
+use gleaner_base::programs::InstallationError;
 use gleaner_base::{Exit, Explain, NotPlain, excerpt};
 use gleaner_lambda::layout::{BUILD_MAX, FILES_MAX};
 use gleaner_lambda::manifest::LambdaKind;
 use gleaner_lambda::{LayoutError, ManifestError};
-use gleaner_parts::PartsError;
-use gleaner_wheels::WheelError;
+use gleaner_supervisor::wheels::WheelError;
 
 use super::requirements::RefusedLine;
 
@@ -49,7 +49,7 @@ pub(super) enum BuildError {
     #[error("the toolchain of `{}` was not installed by rustup", rustc.display())]
     Toolchain { rustc: PathBuf },
     #[error(transparent)]
-    Parts(PartsError),
+    InstalledPrograms(InstallationError),
     #[error("`{text}` is not the platform of a Python on Linux")]
     Platform { text: String },
     #[error("`{}`, line {}: `{}` {}", path.display(), it.number, excerpt(&it.text), it.reason)]
@@ -129,7 +129,7 @@ impl Explain for BuildError {
             BuildError::Toolchain { .. } => {
                 "remove the rust-toolchain.toml that names it, or set RUSTUP_TOOLCHAIN"
             }
-            BuildError::Parts(error) => return error.help(),
+            BuildError::InstalledPrograms(error) => return error.help(),
             BuildError::Wheel(error) => return error.help(),
             BuildError::Platform { .. } => {
                 "write the version of its glibc and its processor: --python-platform \
@@ -162,7 +162,7 @@ impl Explain for BuildError {
         match self {
             BuildError::File { source, .. } if NotPlain::of(source).is_none() => Exit::Internal,
             BuildError::Sources(error) | BuildError::Layout(error) => error.exit(),
-            BuildError::Parts(error) => error.exit(),
+            BuildError::InstalledPrograms(error) => error.exit(),
             BuildError::Wheel(error) => error.exit(),
             BuildError::NoSandbox => Exit::Denied,
             _ => Exit::Usage,

@@ -13,8 +13,8 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
+use gleaner_base::programs::InstalledPrograms;
 use gleaner_base::{NotPlain, hex, safe_file};
-use gleaner_parts::Parts;
 use serde::Deserialize;
 use sha2::{Digest, Sha256};
 
@@ -121,7 +121,9 @@ pub(super) fn fetcher(
 }
 
 fn shim() -> Result<PathBuf, BuildError> {
-    Parts::find().and_then(|parts| parts.program("gleaner-shim")).map_err(BuildError::Parts)
+    InstalledPrograms::find()
+        .and_then(|parts| parts.program("gleaner-shim"))
+        .map_err(BuildError::InstalledPrograms)
 }
 
 /// Returns the sysroot of the compiler that the user has chosen. Only a toolchain that rustup

@@ -9,12 +9,12 @@ use std::fs::{self, File};
 use std::io::{self, ErrorKind};
 use std::path::Path;
 
+use gleaner_base::programs::InstalledPrograms;
 use gleaner_base::text::shell_word;
 use gleaner_base::{PlainFile, hex};
 use gleaner_lambda::layout::FILE_MAX;
 use gleaner_lambda::{BuildDir, REQUIREMENTS, SOURCE_MAX};
-use gleaner_parts::Parts;
-use gleaner_wheels::WHEELS;
+use gleaner_supervisor::wheels::WHEELS;
 use sha2::{Digest, Sha256};
 
 use super::error::{BuildError, failed};
@@ -38,7 +38,9 @@ pub(super) fn add(args: &BuildArgs, partial: &mut PartialBuild) -> Result<(), Bu
     };
     let text = requirements::parse(&text);
     let text = text.map_err(|it| BuildError::Requirement { path: path.clone(), it })?;
-    let python = Parts::find().and_then(|it| it.python(None)).map_err(BuildError::Parts)?;
+    let python = InstalledPrograms::find()
+        .and_then(|it| it.python(None))
+        .map_err(BuildError::InstalledPrograms)?;
     let platforms = args.python_platform.as_deref().map_or(Ok(Vec::new()), platforms)?;
     let [version, platform] = [&args.python_version, &args.python_platform]
         .map(|it| it.clone().unwrap_or_else(|| format!("that of {}", python.display())));
@@ -83,7 +85,7 @@ fn reuse(former: &BuildDir, lock: &[u8], folder: &Path) -> io::Result<bool> {
     if PlainFile::inside(former.path(), &path, SOURCE_MAX)?.read_whole()? != lock {
         return Ok(false);
     }
-    for wheel in gleaner_wheels::wheels_of(former).map_err(io::Error::other)? {
+    for wheel in gleaner_supervisor::wheels::wheels_of(former).map_err(io::Error::other)? {
         let path = folder.join(wheel.file_name().unwrap_or_default());
         PlainFile::inside(former.path(), &wheel, FILE_MAX)?.copy_to(&mut File::create(&path)?)?;
         if !is_locked(lock, &sha256(PlainFile::result(&path, FILE_MAX)?)?) {
@@ -121,7 +123,7 @@ fn check(
             let wheel = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
             return Err(BuildError::Unlocked { wheel, sha256, path: requirements.to_owned() });
         }
-        let name = gleaner_wheels::check(&path).map_err(BuildError::Wheel)?;
+        let name = gleaner_supervisor::wheels::check(&path).map_err(BuildError::Wheel)?;
         has_numpy |= name.distribution() == "numpy";
     }
     match has_numpy {

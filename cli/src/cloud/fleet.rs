@@ -37,7 +37,7 @@ pub(super) fn fleet(args: &FleetArgs) -> Result<Exit, Failure> {
     let path = format!("{}/{change}", path(id)?);
     let deployment: FleetDeployment = client()?.post(&path, &json!({}))?;
     show(args.json, &deployment, |deployment| {
-        let waves = deployment.waves.as_ref().map(waves::in_words);
+        let waves = deployment.waves.as_ref().map(waves::describe);
         format!("{}: {}\n", visible(&deployment.id), waves.unwrap_or_default())
     })
 }
@@ -60,7 +60,7 @@ fn list(json: bool) -> Result<Exit, Failure> {
                 it.release.to_string(),
                 short(&it.revision),
                 if selector.is_empty() { "all".to_owned() } else { selector },
-                if it.is_wanted { "wanted" } else { "stopped" }.to_owned(),
+                if it.is_wanted { "active" } else { "stopped" }.to_owned(),
                 it.vehicles.to_string(),
                 it.running.to_string(),
                 failed,
@@ -68,7 +68,7 @@ fn list(json: bool) -> Result<Exit, Failure> {
         });
         let mut text = table(&head, rows, &[1, 5, 6]);
         for (it, waves) in deployments.iter().filter_map(|it| Some((it, it.waves.as_ref()?))) {
-            text += &format!("{}: {}\n", visible(&it.id), waves::in_words(waves));
+            text += &format!("{}: {}\n", visible(&it.id), waves::describe(waves));
         }
         text
     })

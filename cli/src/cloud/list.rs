@@ -70,7 +70,7 @@ pub(super) fn first<T: DeserializeOwned>(
 }
 
 fn endless(path: &str, cause: &str) -> Failure {
-    let failure = Failure::new(Exit::Internal, format!("the list `{path}` has no end"));
+    let failure = Failure::new(Exit::Internal, format!("the list `{path}` does not end"));
     Failure { causes: vec![cause.to_owned()], ..failure }
         .with_help("choose fewer with the options of the command, or check the cloud")
 }

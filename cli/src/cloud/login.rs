@@ -28,7 +28,7 @@ pub(super) fn login(args: &LoginArgs) -> Result<Exit, Failure> {
     let result = json!({ "user": user, "url": url, "file": file, "expires": session.expires });
     show(args.json, &result, |_| {
         let (name, until) = (visible(&user.name), date(session.expires));
-        format!("logged in to {url} as {name} ({}) until {until}\n", user.role)
+        format!("logged in to {url} as {name} ({}; expires {until})\n", user.role)
     })
 }
 

@@ -45,7 +45,7 @@ pub(super) enum Goal {
 }
 
 impl Goal {
-    fn in_words(self) -> &'static str {
+    fn describe(self) -> &'static str {
         match self {
             Self::Revision { .. } | Self::Running => "runs",
             Self::Fallback => "runs its fallback",
@@ -151,7 +151,7 @@ impl Rollout {
         vehicle: &VehicleSummary,
     ) -> Result<Standing, Failure> {
         let standing = if vehicle.handled < vehicle.wanted {
-            Standing::Pending("it has not handled the change yet".to_owned())
+            Standing::Pending("has not applied the change yet".to_owned())
         } else {
             match client.get(&format!("/v1/vehicles/{}/status", vehicle.name)) {
                 Ok(status) => self.judge(self.goal_of(vehicle), &status, &vehicle.problems),
@@ -166,13 +166,13 @@ impl Rollout {
                 let now = since_1970().as_secs();
                 let seen = vehicle.seen.map(|seen| vehicles::seen_before(now, seen));
                 let seen = seen.map(|seen| format!(", seen {seen}")).unwrap_or_default();
-                Standing::Pending(format!("it is offline{seen}; {reason}"))
+                Standing::Pending(format!("offline{seen}; {reason}"))
             }
             standing => standing,
         })
     }
 
-    /// Compares a status, and the problems with the wanted state, with the goal.
+    /// Compares a status, and the problems with the desired state, with the goal.
     fn judge(&self, goal: Goal, status: &VehicleStatus, problems: &[WantedProblem]) -> Standing {
         let pending = |text: &str| Standing::Pending(text.to_owned());
         let standing = match goal {
@@ -181,9 +181,9 @@ impl Rollout {
                 let is_applied = found.is_none_or(|it| goal == Goal::Stopped && !it.is_wanted);
                 let lambdas = status.supervisor.as_ref().map(|supervisor| &supervisor.lambdas);
                 match lambdas.map(|lambdas| lambdas.iter().any(|it| it.id == self.id)) {
-                    _ if !is_applied => pending("it has not followed the change yet"),
-                    Some(false) => Standing::Done(goal.in_words().to_owned()),
-                    Some(true) => pending("its lambda still ends"),
+                    _ if !is_applied => pending("has not applied the change yet"),
+                    Some(false) => Standing::Done(goal.describe().to_owned()),
+                    Some(true) => pending("its lambda is still stopping"),
                     None => pending("its supervisor does not report"),
                 }
             }
@@ -212,13 +212,13 @@ impl Rollout {
     fn judge_running(&self, status: &VehicleStatus) -> Standing {
         let pending = |text: &str| Standing::Pending(text.to_owned());
         let Some(it) = status.deployments.iter().find(|it| it.id == self.id) else {
-            return pending("it does not have the deployment yet");
+            return pending("does not have the deployment yet");
         };
         if it.envelope.is_empty() && self.envelope.is_some() {
-            return pending("its gleaner is too old to state what it runs: update it");
+            return pending("its gleaner is too old to report what it runs: update gleaner there");
         }
         if self.envelope.as_ref().is_some_and(|envelope| *envelope != it.envelope) {
-            let text = format!("it has another deployment, with release {}", it.release);
+            let text = format!("has another deployment, with release {}", it.release);
             return match self.goal {
                 Goal::Revision { release } if it.release > release => {
                     Standing::Failed(Exit::Differs, text)
@@ -227,7 +227,7 @@ impl Rollout {
             };
         }
         if let Some(refused) = &it.refused {
-            return Standing::Failed(Exit::Denied, format!("it refuses it: {}", visible(refused)));
+            return Standing::Failed(Exit::Denied, format!("refused: {}", visible(refused)));
         }
         let fallback = it.fallback.as_ref().filter(|_| it.runs_fallback);
         let version = visible(&fallback.unwrap_or(&it.revision).version);
@@ -235,21 +235,22 @@ impl Rollout {
             (Goal::Revision { .. }, Some(_)) => {
                 let reason = it.failed.as_deref().map(|it| format!(": {}", in_one_line(it)));
                 let reason = reason.unwrap_or_default();
-                let text = format!("it runs its fallback {version}{reason}");
+                let text = format!("runs its fallback {version}{reason}");
                 return Standing::Failed(Exit::LambdaFaulted, text);
             }
             (Goal::Fallback, None) if it.fallback.is_none() => {
-                return Standing::Failed(Exit::Differs, "it has no fallback".to_owned());
+                let text = format!("keeps release {}, which has no fallback", it.release);
+                return Standing::Failed(Exit::Differs, text);
             }
-            (Goal::Fallback, None) if it.is_wanted => return pending("it runs its revision"),
-            _ if !it.is_wanted => return pending("it is stopped"),
+            (Goal::Fallback, None) if it.is_wanted => return pending("runs its revision"),
+            _ if !it.is_wanted => return pending("is stopped"),
             _ => {}
         }
         let lambda = it.status.as_ref().filter(|lambda| lambda.attempt >= it.attempt);
         let on_probation =
             lambda.filter(|lambda| !it.is_proven && lambda.phase == LambdaPhase::Running);
         if let Some(faults) = on_probation.and_then(|lambda| lambda.recent.faulty()) {
-            let text = format!("it runs {version}, but {faults}");
+            let text = format!("runs {version}, but {faults}");
             return Standing::Failed(Exit::LambdaFaulted, text);
         }
         match lambda.map(|lambda| lambda.phase) {
@@ -257,18 +258,18 @@ impl Rollout {
             Some(LambdaPhase::Quarantined) => {
                 let end = lambda.and_then(|it| it.last_end.as_deref()).map(visible);
                 let reason = end.map(|end| format!(": {end}")).unwrap_or_default();
-                let text = format!("it does not run, and is not started again{reason}");
+                let text = format!("does not run, and is not restarted{reason}");
                 Standing::Failed(Exit::LambdaFaulted, text)
             }
             Some(phase) => Standing::Pending(format!("its lambda is {}", phase.as_str())),
-            None => pending("it has not confirmed a start yet"),
+            None => pending("has not confirmed the start yet"),
         }
     }
 
     fn result(&self, standings: &BTreeMap<String, Standing>, json: bool) -> Result<Exit, Failure> {
         let done = standings.values().filter(|it| it.is_done()).count();
         let all = counted(standings.len() as u64, "vehicle");
-        let (id, words) = (&self.id, self.goal.in_words());
+        let (id, words) = (&self.id, self.goal.describe());
         if json {
             let vehicles = standings.iter().map(|(name, standing)| {
                 let (state, reason) = standing.parts();
@@ -283,9 +284,9 @@ impl Rollout {
         let text = match done == standings.len() {
             true if standings.is_empty() => match self.goal {
                 Goal::Revision { .. } => {
-                    "no vehicle has the labels yet: one that connects with them gets it\n"
+                    "no vehicle matches the labels yet: any that connects with them gets it\n"
                 }
-                _ => "no vehicle has the labels: there is nothing to wait for\n",
+                _ => "no vehicle matches the labels: there is nothing to wait for\n",
             }
             .to_owned(),
             true => format!("`{id}` {words} on {all}\n"),
@@ -309,7 +310,7 @@ impl Rollout {
             .into_iter()
             .find(|exit| exits().any(|it| it == *exit))
             .unwrap_or(Exit::Differs);
-        let message = format!("`{}` {} on {count}", self.id, self.goal.in_words());
+        let message = format!("`{}` {} on {count}", self.id, self.goal.describe());
         let mut failure = Failure::new(exit, message);
         let cause = |(name, standing): (&String, &Standing)| {
             format!("{}: {}", visible(name), standing.parts().1)

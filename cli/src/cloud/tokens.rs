@@ -25,7 +25,7 @@ pub(super) fn tokens(args: &TokensArgs) -> Result<Exit, Failure> {
             show(args.json, &made, |UserToken { user, token, expires }| {
                 let (until, token) = (date(*expires), visible(token));
                 format!(
-                    "made the token {} ({}) until {until}; it is not shown again:\n  {token}\n",
+                    "created token {} ({}; expires {until}). It is not shown again:\n  {token}\n",
                     new.name, user.role
                 )
             })

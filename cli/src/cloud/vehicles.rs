@@ -40,7 +40,7 @@ pub(super) fn vehicles(args: &VehiclesArgs) -> Result<Exit, Failure> {
         Some(VehiclesCommand::Revoke { name }) => {
             client()?.delete(&format!("/v1/vehicles/{name}"))?;
             show(args.json, &json!({ "name": name, "revoked": true }), |_| {
-                format!("revoked {name}: it is cut off\n")
+                format!("revoked {name}\n")
             })
         }
     }
@@ -67,7 +67,7 @@ fn enrol(args: &NewVehicleArgs, json: bool) -> Result<Exit, Failure> {
     })?;
     show(json, &json!({ "name": name, "address": enrolment.address, "file": file }), |_| {
         format!(
-            "wrote {file}, which connects one vehicle as {name}. Copy it there over a safe way:\n  \
+            "wrote {file}: a one-time secret for {name}. Copy it there securely, then run:\n  \
              gleaner enrol {file}\n"
         )
     })
@@ -83,7 +83,7 @@ fn text(vehicles: &[VehicleSummary], now: u64, paint: Paint) -> String {
     if vehicles.is_empty() {
         return "there are no vehicles: `gleaner vehicles enrol NAME --to FILE`\n".to_owned();
     }
-    let head = ["name", "state", "seen", "version", "running", "wanted", "handled"];
+    let head = ["name", "state", "seen", "version", "running", "desired", "applied"];
     let rows = vehicles.iter().map(|vehicle| {
         [
             visible(&vehicle.name),
@@ -149,9 +149,9 @@ mod tests {
         let text = text(&vehicles, 103, Paint::new(false));
         assert_eq!(
             text,
-            "name   state   seen    version  running  wanted  handled\n\
-             car-7  online  3s ago  -            1/2       7        6\n\
-             car-8  online  -       -            1/2       7        6\n\
+            "name   state   seen    version  running  desired  applied\n\
+             car-7  online  3s ago  -            1/2        7        6\n\
+             car-8  online  -       -            1/2        7        6\n\
              car-7: deployment `brake`: no\\u{1b}[31m key\n"
         );
     }

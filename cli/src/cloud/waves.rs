@@ -16,7 +16,7 @@ use crate::vehicle::VehicleClient;
 /// Interval of looks at the waves, which open within seconds at best.
 const POLL_INTERVAL: Duration = Duration::from_secs(1);
 
-pub(super) fn in_words(waves: &WaveProgress) -> String {
+pub(super) fn describe(waves: &WaveProgress) -> String {
     let WaveProgress { wave, waves: all, state, reason, vehicles, running, failed, .. } = waves;
     let reason = match reason.split(' ').next() {
         // Who or what it was.
@@ -29,7 +29,7 @@ pub(super) fn in_words(waves: &WaveProgress) -> String {
         WaveState::Aborted => format!(" aborted{reason}"),
     };
     let vehicles = counted(*vehicles, "vehicle");
-    format!("wave {wave} of {all}{state}; it runs on {running} of {vehicles}, and {failed} failed")
+    format!("wave {wave} of {all}{state}; running on {running} of {vehicles}, {failed} failed")
 }
 
 /// Shows the waves of a deployment, and with `--watch` waits for the last one; returns whether it
@@ -53,7 +53,7 @@ pub(super) fn wait(
             return Err(Failure::new(Exit::Differs, message).with_help("`gleaner fleet` lists all"));
         };
         let Some(waves) = &deployment.waves else { return Ok(true) };
-        let text = in_words(waves);
+        let text = describe(waves);
         if text != shown && !args.vehicle.json {
             print(&format!("{text}\n"))?;
         }

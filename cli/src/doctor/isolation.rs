@@ -1,11 +1,11 @@
 //! Checks the isolation layers of a lambda's process: `gleaner-shim` sets each one up and tests it.
 
-use gleaner_parts::Parts;
+use gleaner_base::programs::InstalledPrograms;
 use gleaner_protocol::{Holds, Layer};
 
 use super::{Finding, Severity, output_of};
 
-pub(super) fn findings(parts: &Parts) -> Vec<Finding> {
+pub(super) fn findings(parts: &InstalledPrograms) -> Vec<Finding> {
     match layers(parts) {
         Ok(layers) => layers.iter().map(finding).collect(),
         Err(why) => {
@@ -14,7 +14,7 @@ pub(super) fn findings(parts: &Parts) -> Vec<Finding> {
     }
 }
 
-fn layers(parts: &Parts) -> Result<Vec<Layer>, String> {
+fn layers(parts: &InstalledPrograms) -> Result<Vec<Layer>, String> {
     let output = output_of(parts, "gleaner-shim", "--layers")?;
     if !output.status.success() {
         return Err(format!(

@@ -8,8 +8,8 @@ mod vehicle;
 
 use std::process::{Command, Output};
 
+use gleaner_base::programs::InstalledPrograms;
 use gleaner_base::{Exit, Failure};
-use gleaner_parts::Parts;
 use serde::Serialize;
 
 use crate::args::DoctorArgs;
@@ -46,7 +46,7 @@ impl Finding {
 
 /// Runs all checks and prints their results. Returns [`Exit::Internal`] if one is an error.
 pub(crate) fn run(args: &DoctorArgs) -> Result<Exit, Failure> {
-    let parts = Parts::find()?;
+    let parts = InstalledPrograms::find()?;
     let mut findings = ["gleaner-runtime", "gleaner-ingress", "gleaner-recorder", "gleaner-shim"]
         .map(|name| program(&parts, name))
         .to_vec();
@@ -62,7 +62,7 @@ pub(crate) fn run(args: &DoctorArgs) -> Result<Exit, Failure> {
     Ok(if has_error { Exit::Internal } else { Exit::Ok })
 }
 
-fn program(parts: &Parts, name: &'static str) -> Finding {
+fn program(parts: &InstalledPrograms, name: &'static str) -> Finding {
     match parts.program(name) {
         Ok(path) => Finding::ok(name, path.display().to_string()),
         Err(error) => {
@@ -73,12 +73,12 @@ fn program(parts: &Parts, name: &'static str) -> Finding {
     }
 }
 
-fn output_of(parts: &Parts, name: &str, argument: &str) -> Result<Output, String> {
+fn output_of(parts: &InstalledPrograms, name: &str, argument: &str) -> Result<Output, String> {
     let program = parts.program(name).map_err(|error| error.to_string())?;
     Command::new(program).arg(argument).output().map_err(|error| error.to_string())
 }
 
-fn optional(parts: &Parts, name: &'static str, why: &str) -> Finding {
+fn optional(parts: &InstalledPrograms, name: &'static str, why: &str) -> Finding {
     let finding = program(parts, name);
     match finding.state {
         Severity::Error => {
@@ -88,7 +88,7 @@ fn optional(parts: &Parts, name: &'static str, why: &str) -> Finding {
     }
 }
 
-fn python(parts: &Parts) -> Finding {
+fn python(parts: &InstalledPrograms) -> Finding {
     match parts.python(None) {
         Ok(python) => Finding::ok("Python", python.display().to_string()),
         Err(error) => {

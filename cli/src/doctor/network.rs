@@ -4,8 +4,8 @@ use std::fs;
 use std::net::Ipv4Addr;
 use std::os::fd::AsRawFd;
 
+use gleaner_base::programs::InstalledPrograms;
 use gleaner_base::{Exit, ignored_variables};
-use gleaner_parts::Parts;
 use gleaner_protocol::ingress::DISCOVERY_GROUP;
 use nix::ifaddrs::getifaddrs;
 use nix::net::if_::InterfaceFlags;
@@ -30,7 +30,7 @@ struct Interface {
     flags: InterfaceFlags,
 }
 
-pub(super) fn findings(parts: &Parts) -> Vec<Finding> {
+pub(super) fn findings(parts: &InstalledPrograms) -> Vec<Finding> {
     let buffer = fs::read_to_string("/proc/sys/net/core/rmem_max");
     let filters = fs::read_to_string("/proc/sys/net/core/optmem_max");
     let routes = fs::read_to_string("/proc/net/route").unwrap_or_default();
@@ -99,20 +99,21 @@ fn socket_filter(max: Option<u64>, handle: rustix::io::Result<()>) -> Finding {
 }
 
 /// Lets the ingress ask for the priority: limits, capabilities and control groups decide.
-fn real_time(parts: &Parts) -> Finding {
+fn real_time(parts: &InstalledPrograms) -> Finding {
     const SUBJECT: &str = "real time";
     match is_real_time_permitted(parts) {
         Ok(true) => Finding::ok(SUBJECT, "permitted to this user"),
         // Few need it, so this is no warning.
         Ok(false) => Finding::ok(
             SUBJECT,
-            "not permitted to this user; only `gleaner run --real-time` needs it, see docs/live.md",
+            "not permitted to this user; only `gleaner run --real-time` needs it, see \
+             docs/live-network.md",
         ),
         Err(why) => Finding::warning(SUBJECT, why, "build it again: cargo build --release"),
     }
 }
 
-fn is_real_time_permitted(parts: &Parts) -> Result<bool, String> {
+fn is_real_time_permitted(parts: &InstalledPrograms) -> Result<bool, String> {
     let output = output_of(parts, "gleaner-ingress", "real-time")?;
     if output.status.success() {
         return Ok(true);

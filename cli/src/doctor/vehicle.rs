@@ -158,7 +158,7 @@ fn access(is_allowed: bool) -> Finding {
     }
     Finding::warning(
         SUBJECT,
-        "this user is no member of the group of the service",
+        "this user is not in the group of the service",
         "`sudo usermod -aG gleaner $USER`, then log in again",
     )
 }

@@ -251,19 +251,7 @@ fn write_summary(
         let clips = counted(summary.clips_replaced, "clip");
         writeln!(text, "  {}", paint.dim(&format!("replaced: {clips} of an earlier replay")))?;
     }
-    for loss in losses(summary) {
-        writeln!(text, "  {}", paint.yellow(&format!("lost: {loss}")))?;
-    }
-    if summary.out_of_order > 0 {
-        let messages = counted(summary.out_of_order, "message");
-        let line = format!("out of order: {messages} came after one with a later log time");
-        writeln!(text, "  {}", paint.yellow(&line))?;
-    }
-    for (topic, messages) in &summary.malformed {
-        let (topic, messages) = (visible(topic), counted(*messages, "message"));
-        let line = format!("malformed: {messages} of `{topic}`, left out");
-        writeln!(text, "  {}", paint.yellow(&line))?;
-    }
+    write_losses(text, summary, paint)?;
     write_early_end(text, summary, paint)?;
 
     if !summary.part.is_all() {
@@ -305,6 +293,23 @@ fn write_faults(text: &mut String, faults: u64, digest: &Digest, paint: Paint) -
     more(text, digest.other_faults)
 }
 
+fn write_losses(text: &mut String, summary: &ReplaySummary, paint: Paint) -> fmt::Result {
+    for loss in losses(summary) {
+        writeln!(text, "  {}", paint.yellow(&format!("lost: {loss}")))?;
+    }
+    if summary.out_of_order > 0 {
+        let messages = counted(summary.out_of_order, "message");
+        let line = format!("out of order: {messages} came after one with a later log time");
+        writeln!(text, "  {}", paint.yellow(&line))?;
+    }
+    for (topic, messages) in &summary.malformed {
+        let (topic, messages) = (visible(topic), counted(*messages, "message"));
+        let line = format!("malformed: {messages} of `{topic}`, left out");
+        writeln!(text, "  {}", paint.yellow(&line))?;
+    }
+    Ok(())
+}
+
 /// Writes the reason why the results end before the drive, if they do.
 fn write_early_end(text: &mut String, summary: &ReplaySummary, paint: Paint) -> fmt::Result {
     if let Some(damage) = &summary.damaged {
@@ -324,7 +329,7 @@ fn write_early_end(text: &mut String, summary: &ReplaySummary, paint: Paint) -> 
 /// Writes a line for each cause of data that the recorder did not record.
 fn write_counted(text: &mut String, recording: &RecordingCounts, paint: Paint) -> fmt::Result {
     for counted in recording.by_cause().into_iter().filter(|counted| counted.count > 0) {
-        let line = counted.in_words();
+        let line = counted.describe();
         let line = match counted.outcome {
             LossOutcome::NoWindow => paint.dim(&line),
             _ => paint.yellow(&line),
@@ -344,7 +349,7 @@ fn more(text: &mut String, count: u64) -> fmt::Result {
 /// Causes of losses, of a replay and live.
 const OVER_RATE: &str = "over the rate limit";
 const OVER_EVENTS: &str = "refused: over `events_per_minute`";
-const BACKED_OFF: &str = "skipped in the pauses after repeated faults";
+const BACKED_OFF: &str = "skipped: backing off after repeated faults";
 
 /// Returns a line for each loss, with its cause. Samples that newer ones overwrote in a ring do not
 /// count as lost.

@@ -186,7 +186,7 @@ fn losses_have_causes_and_overwritten_samples_are_no_loss() {
             "1 event sample, skipped",
             "3,000 log lines, over the rate limit",
             "1 trigger, refused: over `events_per_minute`",
-            "2 wakes, skipped in the pauses after repeated faults",
+            "2 wakes, skipped: backing off after repeated faults",
         ]
     );
 }

@@ -295,29 +295,29 @@ impl VehicleClient {
             request = request.header(*name, value);
         }
         let request = request.body(body).map_err(|error| {
-            Failure::caused_by(Exit::Usage, format!("`{path}` is no request"), &error)
+            Failure::caused_by(Exit::Usage, format!("`{path}` is not a request path"), &error)
         })?;
         let answer = sender.send_request(request).await.map_err(|error| self.lost(&error))?;
         let status = answer.status();
         if status.is_success() {
             return Ok(answer);
         }
-        let problem = serde_json::from_slice::<Problem>(&self.whole(answer.into_body()).await?);
-        let failure = problem.map_or_else(
-            |_| {
-                let exit = match status {
-                    StatusCode::UNAUTHORIZED | StatusCode::FORBIDDEN => Exit::Denied,
-                    _ => Exit::Internal,
-                };
-                Failure::new(exit, format!("{} answers {status}", self.program()))
-            },
-            Failure::from,
-        );
+        let failure = self.refusal(status, &self.whole(answer.into_body()).await?);
         // Without a token, it is the code of a login that was refused.
         Err(match status == StatusCode::UNAUTHORIZED && !token.is_empty() {
             true => failure.with_help(LOGIN_HELP),
             false => failure,
         })
+    }
+
+    /// Returns the failure of an answer with this status and body.
+    fn refusal(&self, status: StatusCode, body: &[u8]) -> Failure {
+        let exit = match status {
+            StatusCode::UNAUTHORIZED | StatusCode::FORBIDDEN => Exit::Denied,
+            _ => Exit::Internal,
+        };
+        let without = |_| Failure::new(exit, format!("{} answers {status}", self.program()));
+        serde_json::from_slice::<Problem>(body).map_or_else(without, Failure::from)
     }
 
     async fn handshake<S>(&self, stream: S) -> Result<http1::SendRequest<Content>, Failure>

@@ -100,7 +100,7 @@ pub(crate) fn path(id: &str) -> Result<String, Failure> {
 pub(super) fn checked_id(id: &str) -> Result<&str, Failure> {
     if id.parse::<ItemName>().is_err() {
         let id = gleaner_base::excerpt(id);
-        return Err(Failure::new(Exit::Usage, format!("`{id}` is no id of a deployment"))
+        return Err(Failure::new(Exit::Usage, format!("invalid deployment id `{id}`"))
             .with_help("`gleaner status` lists them"));
     }
     Ok(id)
@@ -365,7 +365,8 @@ fn wait(
     loop {
         let status = client.status()?;
         let Some(deployment) = status.deployments.iter().find(|it| it.id == *id) else {
-            return Err(Failure::new(Exit::Differs, format!("deployment `{id}` is gone")));
+            let message = format!("deployment `{id}` was removed meanwhile");
+            return Err(Failure::new(Exit::Differs, message));
         };
         if let Some(refused) = &deployment.refused {
             let failure = Failure::new(Exit::Denied, format!("deployment `{id}` is refused"));
@@ -460,7 +461,7 @@ fn wait_for_end(client: &VehicleClient, args: &ChangeArgs, done: &str) -> Result
         if started.elapsed() >= args.timeout {
             let id = &args.id;
             return Err(match has_ended {
-                Some(_) => Failure::new(Exit::Differs, format!("`{id}` still ends")),
+                Some(_) => Failure::new(Exit::Differs, format!("`{id}` is still stopping")),
                 None => {
                     let message = format!("{done} `{id}`, but whether it has ended is unknown");
                     let causes = vec!["the supervisor does not report".to_owned()];

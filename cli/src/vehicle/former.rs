@@ -154,7 +154,7 @@ impl<'f> Fallback<'f> {
         self.known.map(|known| &known.manifest)
     }
 
-    fn in_words(self) -> String {
+    fn describe(self) -> String {
         match self.known {
             Some(FormerRevision { revision: Revision { name, version, release, .. }, .. }) => {
                 format!("{name} {version} (release {release})")
@@ -171,7 +171,7 @@ pub(crate) fn changes(
     former: Option<&Former>,
     fallback: Option<Fallback<'_>>,
 ) -> Vec<String> {
-    let fallback = fallback.map_or_else(|| "none".to_owned(), Fallback::in_words);
+    let fallback = fallback.map_or_else(|| "none".to_owned(), Fallback::describe);
     let mut lines = vec![format!("fallback: {fallback}")];
     let (empty, none) = (Grants::default(), BTreeMap::new());
     let (granted, config) = former

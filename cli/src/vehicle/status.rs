@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use gleaner_base::{ByteSize, Exit, Failure, UtcTime, format_duration, in_one_line, visible};
 use gleaner_protocol::LossOutcome;
 use gleaner_protocol::link::RecorderStatus;
-use gleaner_protocol::supervision::{LambdaPhase, LambdaStatus, ProcessStatus};
+use gleaner_protocol::supervision::{LambdaPhase, LambdaStatus, ProcessStatus, SupervisorStatus};
 use gleaner_protocol::vehicle_api::{
     Capacity, ClipsStatus, CloudStatus, DeploymentStatus, FailingStreams, StreamLoss, VehicleStatus,
 };
@@ -60,23 +60,10 @@ pub(super) fn text(status: &VehicleStatus, paint: Paint) -> String {
     for capacity in &status.capacity {
         text += &format!("  {} ({})\n", shared(capacity), visible(&capacity.source));
     }
-    match &status.supervisor {
-        None => text += &format!("  {}\n", paint.red("the supervisor does not run")),
-        Some(supervisor) => {
-            text += &service("ingress", Some(&supervisor.ingress), paint);
-            for health in supervisor.ingress.last.iter().map(|last| &last.health) {
-                let unfiltered = health.network.iter().flat_map(|it| &it.unfiltered);
-                let lacks = unfiltered.chain(&health.dead);
-                text.extend(lacks.map(|why| format!("    {}\n", paint.yellow(&in_one_line(why)))));
-            }
-            text += &service("recorder", supervisor.recorder.as_ref(), paint);
-            text += &losses(supervisor.recorder.as_ref(), paint);
-            text += &service("inference", supervisor.inference.as_ref(), paint);
-            for refused in &supervisor.refused_models {
-                text += &format!("  {}\n", paint.red(&visible(refused)));
-            }
-        }
-    }
+    text += &status.supervisor.as_ref().map_or_else(
+        || format!("  {}\n", paint.red("the supervisor does not run")),
+        |supervisor| services(supervisor, paint),
+    );
     let supervisor = status.supervisor.as_ref().map_or(0, |supervisor| supervisor.events_lost);
     for (program, lost) in [("orchestrator", status.events_lost), ("supervisor", supervisor)] {
         if lost > 0 {
@@ -107,6 +94,22 @@ pub(super) fn text(status: &VehicleStatus, paint: Paint) -> String {
     text
 }
 
+fn services(supervisor: &SupervisorStatus, paint: Paint) -> String {
+    let mut text = service("ingress", Some(&supervisor.ingress), paint);
+    for health in supervisor.ingress.last.iter().map(|last| &last.health) {
+        let unfiltered = health.network.iter().flat_map(|it| &it.unfiltered);
+        let lacks = unfiltered.chain(&health.dead);
+        text.extend(lacks.map(|why| format!("    {}\n", paint.yellow(&in_one_line(why)))));
+    }
+    text += &service("recorder", supervisor.recorder.as_ref(), paint);
+    text += &losses(supervisor.recorder.as_ref(), paint);
+    text += &service("inference", supervisor.inference.as_ref(), paint);
+    for refused in &supervisor.refused_models {
+        text += &format!("  {}\n", paint.red(&visible(refused)));
+    }
+    text
+}
+
 pub(crate) fn labels_in_words(labels: &BTreeMap<String, String>) -> String {
     let labels = labels.iter().map(|(name, value)| format!("{}={}", visible(name), visible(value)));
     labels.collect::<Vec<_>>().join(" ")
@@ -125,23 +128,27 @@ pub(super) fn age(status: &VehicleStatus) -> Option<String> {
 /// Returns the line of the connection to a cloud, if there is one.
 pub(crate) fn cloud_line(status: Option<&CloudStatus>, paint: Paint) -> String {
     let Some(status) = status else { return String::new() };
-    let state = match &*status.state {
-        "connected" => paint.green("connected"),
-        "refused" => paint.red("refused"),
-        state => paint.yellow(&visible(state)),
+    let state = match (&*status.state, &status.reason) {
+        ("connected", _) => paint.green("connected"),
+        ("refused", _) => paint.red("refused"),
+        ("connecting", Some(_)) => paint.yellow("disconnected"),
+        (state, _) => paint.yellow(&visible(state)),
     };
     let reason = status.reason.iter().map(|reason| format!(": {}", in_one_line(reason)));
     let help = status.help.iter().map(|help| format!(". {}", in_one_line(help)));
     let uncounted = match status.uncounted {
         0 => String::new(),
-        count => format!(", and those of {} not counted", counted(count, "stream")),
+        count => format!(" ({} not counted)", counted(count, "stream")),
+    };
+    let unsent = match status.unsent {
+        0 => "no unsent records".to_owned(),
+        count => counted(count, "unsent record"),
     };
     format!(
-        "  cloud {} {state} for {}{}; {} not sent{uncounted}, certificate until {}\n{}{}",
+        "  cloud {} {state} for {}{}; {unsent}{uncounted}, certificate until {}\n{}{}",
         visible(&status.address),
         seconds(status.since_s),
         reason.chain(help).collect::<String>(),
-        counted(status.unsent, "record"),
         UtcTime::of(status.certificate_expires.try_into().unwrap_or(i64::MAX)),
         failing_lines(&status.failing, paint),
         clips_line(&status.clips, paint),
@@ -205,12 +212,12 @@ fn clips_line(clips: &ClipsStatus, paint: Paint) -> String {
     if parts.is_empty() { String::new() } else { format!("  clips: {}\n", parts.join("; ")) }
 }
 
-/// Formats a resource that lambdas share: `memory 1.2 MiB of 8.0 MiB asked for, 0.9 MiB used`.
+/// Formats a resource that lambdas share: `memory: 1.2 MiB reserved of 8.0 MiB allowed`.
 pub(super) fn shared(capacity: &Capacity) -> String {
     let number = |value: f64| amount(value, &capacity.unit);
     let [asked, most] = [capacity.asked, capacity.most].map(number);
-    let used = capacity.used.map(|used| format!(", {} used", number(used))).unwrap_or_default();
-    format!("{} {asked} of {most} asked for{used}", visible(&capacity.resource))
+    let used = capacity.used.map(|used| format!(", {} in use", number(used))).unwrap_or_default();
+    format!("{}: {asked} reserved of {most} allowed{used}", visible(&capacity.resource))
 }
 
 fn amount(number: f64, unit: &str) -> String {
@@ -280,7 +287,7 @@ fn losses(recorder: Option<&ProcessStatus<RecorderStatus>>, paint: Paint) -> Str
     let last = recorder.and_then(|recorder| recorder.last.as_deref());
     let counts = last.map(|last| last.recording.by_cause()).unwrap_or_default();
     let lost = counts.iter().filter(|it| it.count > 0 && it.outcome != LossOutcome::NoWindow);
-    lost.map(|it| format!("    {}\n", paint.yellow(&it.in_words()))).collect()
+    lost.map(|it| format!("    {}\n", paint.yellow(&it.describe()))).collect()
 }
 
 fn service<S>(name: &str, status: Option<&ProcessStatus<S>>, paint: Paint) -> String {

@@ -15,11 +15,11 @@ use gleaner_host::input::open_inputs;
 use gleaner_journal::{Decoder, Encoder, JournalEntry, WakeSource};
 use gleaner_lambda::Manifest;
 use gleaner_messages::Endian;
-use gleaner_operations::Operation::{
+use gleaner_messages::transport::loopback::Loopback;
+use gleaner_messages::transport::{Guid, SampleMeta};
+use gleaner_test_support::operations::Operation::{
     AsFrame, Column, Field, Input as Topics, MeanLuma, Newest, Resize, ToGray,
 };
-use gleaner_transport::loopback::Loopback;
-use gleaner_transport::{Guid, SampleMeta};
 
 use super::pictures::{coded, raw};
 use super::{picture, program};

@@ -10,7 +10,7 @@ mod driver;
 #[cfg(feature = "calls")]
 mod pictures;
 
-use gleaner_operations::{DriverStep, Operation};
+use gleaner_test_support::operations::{DriverStep, Operation};
 
 /// Separator of wakes.
 pub const WAKE: &[u8] = b"WAKE";

@@ -33,7 +33,6 @@ pub const WORDS: &[&str] = &[
     "timestamp",
 ];
 
-/// All seeds.
 pub fn all() -> Vec<Vec<u8>> {
     let topics = "  topics_with_message_count:\n    - topic_metadata:\n        name: /a\n        \
                   type: test_msgs/msg/Number\n        serialization_format: cdr\n        \

@@ -1,10 +1,10 @@
 //! Seeds: programs of `driver`, one for each of its calls, and some longer ones.
 
-use gleaner_operations::Operation::{Append, ScratchGet, ScratchPut, Start};
-use gleaner_operations::Operation::{
+use gleaner_test_support::operations::Operation::{Append, ScratchGet, ScratchPut, Start};
+use gleaner_test_support::operations::Operation::{
     AsFrame, Event, Field, Histogram, Last, Log, MeanLuma, Resize, ToGray,
 };
-use gleaner_operations::{DriverStep, Extra, Operation, setup};
+use gleaner_test_support::operations::{DriverStep, Extra, Operation, setup};
 
 use crate::calls::{WAKE, program};
 
@@ -28,7 +28,6 @@ pub const WORDS: &[&str] = &[
     "\0\0\0\u{4}\0",
 ];
 
-/// All seeds.
 pub fn all() -> Vec<Vec<u8>> {
     let operations = || {
         Operation::ALL

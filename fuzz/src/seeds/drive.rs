@@ -20,7 +20,6 @@ pub const WORDS: &[&str] = &[
     "test_msgs/msg/Number",
 ];
 
-/// All seeds.
 pub fn all() -> Vec<Vec<u8>> {
     let small = || WriteOptions::new().profile("ros2").library("").chunk_size(Some(200));
     let unchecked = || {

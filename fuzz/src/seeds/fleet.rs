@@ -33,7 +33,6 @@ const REPORT: &str = r#"{"cursor":"1","clips":[{"name":"brake-1","from_ns":1,"to
 const ORDERS: &str = r#"{"cursor":"1","thumbnails":["brake-1"],
     "wanted":[{"name":"brake-1","bytes":9,"sha256":"5","part":0}]}"#;
 
-/// All seeds.
 pub fn all() -> Vec<Vec<u8>> {
     let cursor = Cursor {
         stream: "lambdas/brake".to_owned(),

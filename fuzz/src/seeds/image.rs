@@ -28,7 +28,6 @@ pub const WORDS: &[&str] = &[
 
 const SIDE: u16 = 12;
 
-/// All seeds.
 pub fn all() -> Vec<Vec<u8>> {
     let mut seeds = Vec::new();
     for sampling in [SamplingFactor::F_1_1, SamplingFactor::F_2_1, SamplingFactor::F_2_2] {

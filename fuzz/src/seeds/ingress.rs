@@ -1,7 +1,7 @@
 //! Seeds: conversations with the ingress, and of a starter with a program that it starts.
 
 use gleaner_protocol::ingress::{
-    AddReader, AddTopics, AttachedTopic, HoldGrant, PublishGrant, Qos, ReaderMessage, RefusedTopic,
+    AddReader, AddTopics, AttachedTopic, PinGrant, PublishGrant, Qos, ReaderMessage, RefusedTopic,
     RegionLayout, TopicGrant,
 };
 
@@ -107,7 +107,7 @@ fn grant(id: u32) -> TopicGrant {
         queue: 10,
         max_bytes: Some(4096),
         depth: 20,
-        holds: HoldGrant { windows: 1, window: 20, singles: 3 },
+        holds: PinGrant { windows: 1, window: 20, singles: 3 },
         wakes: true,
         ..TopicGrant::default()
     }
@@ -118,7 +118,7 @@ fn attached() -> AttachedTopic {
         id: 1,
         type_name: "sensor_msgs/msg/Imu".to_owned(),
         layout: RegionLayout { depth: 20, slots: 50, slot_bytes: 4096 },
-        holds: HoldGrant { windows: 1, window: 20, singles: 3 },
+        holds: PinGrant { windows: 1, window: 20, singles: 3 },
         first: 9,
         ..AttachedTopic::default()
     }

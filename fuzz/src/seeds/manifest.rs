@@ -120,7 +120,6 @@ level = { default = -0.5, min = -1.0, max = 1e300 }
 word = "text"
 "#;
 
-/// All seeds.
 pub fn all() -> Vec<Vec<u8>> {
     let seeds = [
         EVERY_KEY,

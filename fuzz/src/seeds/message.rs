@@ -54,7 +54,6 @@ const DEFINED: [&str; 4] = [
      string[2] d\nfloat64 e # with a comment\n",
 ];
 
-/// All seeds.
 pub fn all() -> Vec<Vec<u8>> {
     let mut seeds = Vec::new();
     let ones = |order: u8| if order == 0 { [1, 0, 0, 0] } else { [0, 0, 0, 1] }.repeat(80);

@@ -23,10 +23,6 @@ use crate::TARGETS;
 
 /// Writes the seeds of each target to files in a folder of its name, its dictionary to
 /// `<name>.dict` in libFuzzer's format, and the longest input to `<name>.longest`, in bytes.
-///
-/// # Errors
-///
-/// The error of the file system.
 pub fn write(folder: &Path) -> io::Result<()> {
     for target in TARGETS {
         let seeds = folder.join(target.name);

@@ -8,7 +8,9 @@ use gleaner_protocol::inference::{
 
 use crate::image::ENCODINGS;
 use crate::model::mode;
-use crate::onnx::{self, ANY, BOOL, FLOAT32, INT64, Proto, constant, graph, node, value, value_of};
+use gleaner_test_support::onnx::{
+    self, ANY, BOOL, FLOAT32, INT64, Proto, constant, graph, node, value, value_of,
+};
 
 /// Dictionary: names of operators, keys of requests, and texts with a meaning.
 pub const WORDS: &[&str] = &[
@@ -38,7 +40,6 @@ pub const WORDS: &[&str] = &[
     "\0\0\0\u{7f}",
 ];
 
-/// All seeds.
 pub fn all() -> Vec<Vec<u8>> {
     let files = models().into_iter().map(|file| with_mode(mode::FILE, &file));
     let requests = requests().into_iter().map(|request| {

@@ -51,7 +51,6 @@ pub const WORDS: &[&str] = &[
     TrustRoot::TYPE,
 ];
 
-/// All seeds.
 pub fn all() -> Vec<Vec<u8>> {
     let digest = "0123456789abcdef".repeat(4);
     let revision = format!(

@@ -6,13 +6,13 @@
 /// The interfaces, in the modules in which wit-bindgen puts them.
 pub(crate) mod gleaner {
     pub(crate) mod lambda {
-        pub(crate) use crate::generated::gleaner::lambda::types;
+        pub(crate) use crate::bindings::gleaner::lambda::types;
         pub(crate) use crate::testing::{data, inference, log, scratch, trigger};
     }
 }
 
 use self::gleaner::lambda::data::Wake;
-pub use crate::generated::{ConfigEntry, ConfigValue};
+pub use crate::bindings::{ConfigEntry, ConfigValue};
 
 /// Functions that a component exports.
 #[allow(missing_docs, clippy::missing_errors_doc)]
@@ -27,7 +27,7 @@ pub trait Guest {
 macro_rules! __export_lambda_natively {
     ($exported:ident) => {
         const _: fn() = || {
-            fn is_guest<T: $crate::bindings::Guest>() {}
+            fn is_guest<T: $crate::world::Guest>() {}
             is_guest::<$exported>();
         };
     };

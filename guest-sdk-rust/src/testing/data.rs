@@ -14,8 +14,8 @@ use super::message::{ENCAPSULATION, Message};
 use super::path::{FieldPath, FieldRef, MissingField, known};
 use super::ring::{Cell, Ring};
 use super::session::{Handle, HandleCounter, current};
+use crate::bindings::gleaner::lambda::types::Column;
 use crate::data::{Counts, DataError, Identity, Stamps, Value};
-use crate::generated::gleaner::lambda::types::Column;
 
 type CallResult<T> = Result<T, DataError>;
 

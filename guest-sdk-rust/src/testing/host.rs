@@ -17,7 +17,7 @@ use super::model::FakeModel;
 use super::run::Run;
 use super::schedule::{EventInput, Schedule};
 use super::session::{HandleCounter, Session};
-use crate::bindings::ConfigValue;
+use crate::world::ConfigValue;
 use crate::{Config, Lambda};
 
 /// A fake host, configured to load a lambda.

@@ -11,10 +11,10 @@ use super::data::Frame;
 use super::manifest::Limits;
 use super::model::{FakeModel, SeenFrame};
 use super::session::{Handle, HandleCounter, current};
-use crate::data::{Encoding, encoding_name};
-pub use crate::generated::gleaner::lambda::inference::{
+pub use crate::bindings::gleaner::lambda::inference::{
     DetectOptions, Detection, ElementType, InferenceError, TensorInfo,
 };
+use crate::data::{Encoding, encoding_name};
 use crate::inference::Preprocess;
 
 const MAX_DIMENSIONS: usize = 8;

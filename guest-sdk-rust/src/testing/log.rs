@@ -5,7 +5,7 @@ use gleaner_rules::log::{Rate, line};
 
 use super::manifest::Limits;
 use super::session::current;
-pub use crate::generated::gleaner::lambda::log::Level;
+pub use crate::bindings::gleaner::lambda::log::Level;
 
 /// One line of the log.
 #[derive(Clone, Debug, PartialEq, Eq)]

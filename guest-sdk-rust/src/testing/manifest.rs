@@ -12,7 +12,7 @@ use toml::Value;
 use super::error::{Error, nearest};
 use super::limits::LIMITS;
 use super::table::{Bounds, Table};
-use crate::bindings::{ConfigEntry, ConfigValue};
+use crate::world::{ConfigEntry, ConfigValue};
 
 type Result<T> = std::result::Result<T, Error>;
 

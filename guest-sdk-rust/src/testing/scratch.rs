@@ -5,7 +5,7 @@ pub use gleaner_rules::scratch::Entry;
 use gleaner_rules::scratch::ScratchError as Refused;
 
 use super::session::current;
-pub use crate::generated::gleaner::lambda::scratch::ScratchError;
+pub use crate::bindings::gleaner::lambda::scratch::ScratchError;
 
 type CallResult<T> = Result<T, ScratchError>;
 

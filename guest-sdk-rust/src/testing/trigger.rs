@@ -6,7 +6,7 @@ use gleaner_rules::triggers::{TriggerError as Refused, TriggerKind};
 
 use super::decision::Trigger;
 use super::session::current;
-pub use crate::generated::gleaner::lambda::trigger::TriggerError;
+pub use crate::bindings::gleaner::lambda::trigger::TriggerError;
 
 type CallResult = Result<(), TriggerError>;
 

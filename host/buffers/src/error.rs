@@ -7,41 +7,17 @@ use std::{error::Error, fmt};
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PoolError {
     /// A pool has 1 to 2^31 - 1 slots.
-    SlotCount {
-        /// Requested number of slots.
-        slots: usize,
-    },
+    SlotCount { slots: usize },
     /// Slots of this size and number do not fit the address space.
-    TooLarge {
-        /// Requested number of slots.
-        slots: usize,
-        /// Requested bytes in each.
-        slot_bytes: usize,
-    },
+    TooLarge { slots: usize, slot_bytes: usize },
     /// The region is smaller than [`Pool::bytes_needed`](crate::Pool::bytes_needed).
-    RegionTooSmall {
-        /// Bytes that the slots need.
-        needed: usize,
-        /// Bytes that the region has.
-        given: usize,
-    },
+    RegionTooSmall { needed: usize, given: usize },
     /// The region does not start at a multiple of 64.
-    RegionUnaligned {
-        /// Address at which it starts.
-        address: usize,
-    },
+    RegionUnaligned { address: usize },
     /// The allocator returned no memory.
-    OutOfMemory {
-        /// Requested bytes.
-        bytes: usize,
-    },
+    OutOfMemory { bytes: usize },
     /// A ring shows at least one sample, and at most as many as its pool has slots.
-    Depth {
-        /// Requested depth.
-        depth: usize,
-        /// Slots of the pool.
-        slots: usize,
-    },
+    Depth { depth: usize, slots: usize },
 }
 
 impl fmt::Display for PoolError {
@@ -75,13 +51,8 @@ impl Error for PoolError {}
 /// Reasons why there is no slot for a sample.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum DraftError {
-    /// The sample is larger than a slot.
-    TooBig {
-        /// Requested bytes.
-        len: usize,
-        /// Bytes in a slot.
-        max: usize,
-    },
+    /// The sample of `len` bytes is larger than a slot, which has `max` bytes.
+    TooBig { len: usize, max: usize },
     /// No slot is free and, for a ring, none of its samples is unpinned.
     NoSlot,
 }

@@ -40,10 +40,6 @@ pub struct HeapRegion {
 impl HeapRegion {
     /// Allocates `len` zeroed bytes, at least 1. Every page has been written to, so that no later
     /// write causes a page fault.
-    ///
-    /// # Errors
-    ///
-    /// [`PoolError::OutOfMemory`] if the allocator refuses.
     pub fn zeroed(len: usize) -> Result<Self, PoolError> {
         let refused = PoolError::OutOfMemory { bytes: len };
         let layout = Layout::from_size_align(len.max(1), PAGE).map_err(|_| refused)?;

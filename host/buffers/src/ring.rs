@@ -56,8 +56,7 @@ pub struct RingCounts {
     pub too_big: u64,
 }
 
-/// The error for a draft of another pool than the ring's: it is returned, and nothing was
-/// published.
+/// The draft belongs to another pool. Nothing was published; the caller gets the draft back.
 pub struct ForeignDraft<M>(pub Draft<M>);
 
 impl<M> fmt::Debug for ForeignDraft<M> {
@@ -289,11 +288,8 @@ impl<M> RingWriter<M> {
     /// Publishes a sample to the readers, and returns its position: 0, 1, 2, ...
     ///
     /// The sample `depth` positions before it leaves the ring, and is counted unless it was evicted
-    /// before. Its slot returns to the pool with the last lease on it.
-    ///
-    /// # Errors
-    ///
-    /// [`ForeignDraft`] if the draft is of another pool.
+    /// before. Its slot returns to the pool with the last lease on it. Fails if the draft is of
+    /// another pool.
     pub fn publish(&mut self, draft: Draft<M>, meta: M) -> Result<u64, ForeignDraft<M>> {
         let ring = &*self.shared;
         if !ring.pool.owns(&draft) {

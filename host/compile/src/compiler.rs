@@ -11,10 +11,6 @@ use super::{
 
 /// Compiles the component at `path` into the folder `store` and returns the path of the entry. A
 /// healthy entry is kept, a damaged one replaced.
-///
-/// # Errors
-///
-/// [`CompileError`] names the component and the cause.
 pub fn compile(path: &Path, store: &Path, nans: Nans) -> Result<PathBuf, CompileError> {
     let component = read_component(path)?;
     if let Some(why) = NoComponent::of(&component) {

@@ -7,7 +7,7 @@ use std::process::ExitCode;
 use clap::Parser;
 use gleaner_base::{Exit, Failure};
 use gleaner_compile::{COMPILE_CPU_SECONDS, COMPILE_MEMORY_BYTES, CompileError, Nans};
-use gleaner_jail::{Paths, files, sandbox_filter};
+use gleaner_sandbox::{Paths, files, sandbox_filter};
 use rustix::process::{Resource, Rlimit, setrlimit};
 
 /// Compiles a WebAssembly component to native code for this machine.

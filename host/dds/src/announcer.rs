@@ -41,8 +41,8 @@ const AFTER: [Duration; 5] = [
 /// The longest announcement that is repeated.
 const LONGEST: usize = 8 << 10;
 /// Most datagrams that are read at a time, and most interfaces that are used.
-const MOST_READ: usize = 64;
-const MOST_INTERFACES: usize = 16;
+const MAX_READ: usize = 64;
+const MAX_INTERFACES: usize = 16;
 
 /// A port at which RustDDS announces our participant, to be opened before there is one.
 pub(super) struct Announcements(Option<UdpSocket>);
@@ -61,7 +61,7 @@ impl Announcements {
     /// Returns the announcement of the participant with this prefix, if it has arrived.
     fn read(&self, own: Prefix) -> Option<Vec<u8>> {
         let mut bytes = vec![0; LONGEST + 1];
-        for _ in 0..MOST_READ {
+        for _ in 0..MAX_READ {
             let (length, _) = self.0.as_ref()?.recv_from(&mut bytes).ok()?;
             let datagram = &bytes[..length];
             // Other programs of this machine send to this port, too. RTPS: the header is "RTPS",
@@ -98,7 +98,7 @@ impl Announcer {
         interfaces: &[IpAddr],
     ) -> Self {
         let senders = senders(interfaces).unwrap_or_else(|error| {
-            debug!(%error, "announcements are not repeated");
+            debug!(%error, "could not repeat announcements");
             Vec::new()
         });
         let group = SocketAddrV4::new(DISCOVERY_GROUP, port_of_samples(domain) - 1);
@@ -166,7 +166,7 @@ fn senders(interfaces: &[IpAddr]) -> io::Result<Vec<UdpSocket>> {
     };
     addresses
         .filter(|address| interfaces.is_empty() || interfaces.contains(&IpAddr::V4(*address)))
-        .take(MOST_INTERFACES)
+        .take(MAX_INTERFACES)
         .map(sender)
         .collect()
 }

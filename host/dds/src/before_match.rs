@@ -10,7 +10,7 @@
 
 use std::collections::HashMap;
 
-use gleaner_transport::{Guid, SampleMeta};
+use gleaner_messages::transport::{Guid, SampleMeta};
 
 /// Most writers whose first samples are tracked.
 const MOST: usize = 256;

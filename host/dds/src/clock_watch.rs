@@ -2,7 +2,7 @@
 //! best-effort writers by the time of arrival (`src/structure/dds_cache.rs`,
 //! `get_changes_in_range_best_effort`).
 
-use gleaner_transport::clock::monotonic;
+use gleaner_messages::transport::clock::monotonic;
 
 /// Detects that the time of day was set back.
 ///
@@ -17,10 +17,10 @@ pub(super) struct ClockWatch {
 
 impl ClockWatch {
     /// Smaller steps are ignored: after that time all is well again.
-    const MOST_NS: i64 = 1_000_000_000;
+    const MAX_NS: i64 = 1_000_000_000;
     /// Longest time between the two readings of `CLOCK_MONOTONIC`; if it was longer, the thread was
     /// stopped in between.
-    const MOST_GAP_NS: i64 = 100_000_000;
+    const MAX_GAP_NS: i64 = 100_000_000;
 
     /// `shown` returns the time of day, in ns.
     pub(super) fn new(shown: fn() -> i64) -> Self {
@@ -31,12 +31,12 @@ impl ClockWatch {
     /// clock that is slewed, however far, does not count.
     pub(super) fn set_back(&mut self) -> Option<i64> {
         let (before, day, after) = (monotonic(), (self.shown)(), monotonic());
-        if after.saturating_sub(before) > Self::MOST_GAP_NS {
+        if after.saturating_sub(before) > Self::MAX_GAP_NS {
             return None;
         }
         let ahead = day.saturating_sub(before);
         let back = self.ahead_ns.replace(ahead).map(|last| last.saturating_sub(ahead));
-        back.filter(|back| *back > Self::MOST_NS)
+        back.filter(|back| *back > Self::MAX_NS)
     }
 }
 

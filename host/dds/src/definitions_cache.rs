@@ -16,12 +16,12 @@ use super::receive::{ReceiverCommand, ReceiverHandle};
 use super::state::ParticipantState;
 use super::type_query::{Attempts, QueryOutcome, Retry, TypeQuery};
 use gleaner_base::chain;
+use gleaner_messages::transport::DefinitionsSearch;
 use gleaner_messages::type_description::{DescribedDefinitions, type_hash};
 use gleaner_messages::{Definitions, MessageError, Sources, SourcesError};
-use gleaner_transport::DefinitionsSearch;
 
 /// Most queries for one type that are sent to a node.
-const MOST_QUERIES: usize = 3;
+const MAX_QUERIES: usize = 3;
 /// Time that the receive thread may take for a query, which has a shorter limit of its own there.
 const TIMEOUT: Duration = Duration::from_secs(10);
 /// Time after the start in which a writer may exist that is not discovered yet.
@@ -131,7 +131,7 @@ impl DefinitionsCache {
                 continue;
             };
             let Missing { attempts: before, settled, pause } = *missing;
-            if settled || before.times >= MOST_QUERIES || pause.is_some_and(|until| now < until) {
+            if settled || before.times >= MAX_QUERIES || pause.is_some_and(|until| now < until) {
                 search = DefinitionsSearch::Ended;
                 continue;
             }
@@ -190,7 +190,7 @@ impl DefinitionsCache {
         let mut attempts = Attempts { times: query.before.times + 1, ..query.before };
         let entry = match outcome {
             QueryOutcome::Failed { why, retry: Retry::Unsent } => {
-                info!(type_name, why, "no node can be asked for the definition of this type yet");
+                info!(type_name, why, "no node offers the definition of this type yet; will retry");
                 let pause = Some(Instant::now() + PAUSE);
                 CachedType::Missing(Missing { attempts: query.before, settled: false, pause })
             }
@@ -209,20 +209,7 @@ impl DefinitionsCache {
             }
             QueryOutcome::Answer { node, hash, cdr, endian } => {
                 match DescribedDefinitions::read(type_name, &hash, &cdr, endian) {
-                    Ok(DescribedDefinitions { text, without_texts }) => {
-                        let comments = without_texts
-                            .map_or("as their author wrote them".to_owned(), |why| visible(&why));
-                        info!(
-                            type_name,
-                            node, hash, comments, "definitions from a node that writes this type"
-                        );
-                        let found = || CachedType::Text(text.clone(), None, Some(hash.clone()));
-                        // Without a local one, for writers that announce no hash, too.
-                        if at_hand.is_none() {
-                            self.types.insert((query.type_name.clone(), None), found());
-                        }
-                        found()
-                    }
+                    Ok(described) => self.found(&query, &node, hash, described, at_hand.is_none()),
                     Err(error) => {
                         let error = visible(&chain(&error));
                         warn!(
@@ -241,6 +228,27 @@ impl DefinitionsCache {
             }
         };
         self.types.insert((query.type_name, query.type_hash), entry);
+    }
+
+    /// Returns the entry of the definitions that `node` sent; if there is `no_local` one, they are
+    /// also those of writers that announce no hash.
+    fn found(
+        &mut self,
+        query: &TypeQuery,
+        node: &str,
+        hash: String,
+        DescribedDefinitions { text, without_texts }: DescribedDefinitions,
+        no_local: bool,
+    ) -> CachedType {
+        let type_name = &query.type_name;
+        let comments =
+            without_texts.map_or("as their author wrote them".to_owned(), |why| visible(&why));
+        info!(type_name, node, hash, comments, "received definitions from a writer of this type");
+        let entry = || CachedType::Text(text.clone(), None, Some(hash.clone()));
+        if no_local {
+            self.types.insert((type_name.clone(), None), entry());
+        }
+        entry()
     }
 
     fn entry(&mut self, type_name: &str, hash: Option<&str>) -> &mut CachedType {

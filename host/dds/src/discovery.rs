@@ -10,7 +10,7 @@ use super::names::{ros_topic, ros_type, visible};
 use super::qos::{Offer, as_rosbag2, describe};
 use super::type_check::LeftOut;
 use super::type_query::type_hash;
-use gleaner_transport::Guid;
+use gleaner_messages::transport::Guid;
 
 /// Most topics that are listed.
 const TOPICS: usize = 4096;

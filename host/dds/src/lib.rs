@@ -17,7 +17,7 @@
 //! RustDDS does not expose bytes 2 and 3 of a sample's encapsulation (they are given as zeros). It
 //! drops samples that are badly broken by itself; they show as lost.
 //!
-//! [`Qos::Auto`]: gleaner_transport::Qos::Auto
+//! [`Qos::Auto`]: gleaner_messages::transport::Qos::Auto
 
 mod announcer;
 #[cfg(feature = "clap")]
@@ -62,20 +62,20 @@ use tracing::{info, warn};
 pub use arguments::NetworkArgs;
 pub use discovery::DomainTopic;
 pub use options::{DdsError, DdsOptions, Distro};
-pub use receive::MOST_MAPPED;
+pub use receive::MAX_MAPPED;
 pub use writer::TopicWriter;
 
 use announcer::{Announcements, Announcer};
 use definitions_cache::DefinitionsCache;
 use discovery::ListedTopic;
 use gleaner_base::text::nearest;
-use gleaner_messages::{Definitions, Sources};
-use gleaner_protocol::NetworkStatus;
-use gleaner_protocol::ingress::JoinedParticipant;
-use gleaner_transport::{
+use gleaner_messages::transport::{
     DefinitionsSearch, DiscoveredTopic, Health, LiveSource, PublishError, Publisher,
     ReceptionStatus, Sink, Subscription, TopicSpec, Transport, TransportError, same_type,
 };
+use gleaner_messages::{Definitions, Sources};
+use gleaner_protocol::NetworkStatus;
+use gleaner_protocol::ingress::JoinedParticipant;
 use joins::NoJoin;
 use packet_filter::PacketFilter;
 use receive::{ReceiverCommand, ReceiverHandle};
@@ -87,11 +87,11 @@ use type_check::TopicLayout;
 use watchdog::Watchdog;
 
 /// The receive buffer of a socket has room for this many of the largest samples, up to
-/// `MOST_BUFFER`.
+/// `MAX_BUFFER`.
 const SAMPLES_IN_BUFFER: usize = 4;
-const MOST_BUFFER: usize = 64 << 20;
+const MAX_BUFFER: usize = 64 << 20;
 /// The size that RustDDS requests by itself.
-const LEAST_BUFFER: usize = 8 << 20;
+const MIN_BUFFER: usize = 8 << 20;
 /// Time that the receive thread may take to end. A sink that holds a sample then is not waited for.
 const STOP_TIMEOUT: Duration = Duration::from_secs(5);
 
@@ -127,8 +127,8 @@ impl Dds {
     /// [`DdsError`] if it cannot be joined, or if the node's name is invalid.
     pub fn open(options: DdsOptions) -> Result<Self, DdsError> {
         let node = options.checked()?;
-        let needed = options.largest.saturating_mul(SAMPLES_IN_BUFFER).min(MOST_BUFFER);
-        let asked = needed.max(LEAST_BUFFER);
+        let needed = options.largest.saturating_mul(SAMPLES_IN_BUFFER).min(MAX_BUFFER);
+        let asked = needed.max(MIN_BUFFER);
         let opening = OPENING.lock().unwrap_or_else(PoisonError::into_inner);
         let before = sockets::library_threads();
         let mut builder =
@@ -183,11 +183,8 @@ impl Dds {
         })
     }
 
-    /// A writer of `topic`, reliable and volatile, that keeps its `depth` newest samples.
-    ///
-    /// # Errors
-    ///
-    /// [`DdsError`] if a name is not valid in ROS 2.
+    /// A writer of `topic`, reliable and volatile, that keeps its `depth` newest samples. Fails if
+    /// a name is not valid in ROS 2.
     pub fn writer(
         &self,
         topic: &str,

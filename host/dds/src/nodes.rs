@@ -6,7 +6,7 @@ use super::Distro;
 use super::filter::Prefix;
 use super::graph_message::{RemoteNode, nodes};
 use gleaner_messages::Endian;
-use gleaner_transport::Guid;
+use gleaner_messages::transport::Guid;
 
 /// Most participants whose nodes are kept, and the longest graph message that is kept: 4000
 /// endpoints. A participant with a longer one gets no type queries.

@@ -5,8 +5,8 @@ use std::io;
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::PathBuf;
 
-use gleaner_transport::Clock;
-use gleaner_transport::clock::time_of_day;
+use gleaner_messages::transport::Clock;
+use gleaner_messages::transport::clock::time_of_day;
 
 /// The highest domain that has valid ports.
 const LAST_DOMAIN: u16 = 232;

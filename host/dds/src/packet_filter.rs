@@ -73,6 +73,6 @@ impl PacketFilter {
 }
 
 fn report(state: &ParticipantState, error: &io::Error, help: &str) {
-    warn!(%error, help, "no filter for hostile fragments: one packet may claim 4 GiB of memory");
+    warn!(%error, help, "cannot filter hostile fragments: one packet may claim 4 GiB of memory");
     state.set_unfiltered(format!("no filter for hostile fragments: {error}"));
 }

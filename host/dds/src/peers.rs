@@ -6,7 +6,7 @@ use std::ops::RangeBounds;
 use rustdds::{DomainParticipantStatusEvent as Event, GUID};
 
 use super::filter::Prefix;
-use gleaner_transport::Guid;
+use gleaner_messages::transport::Guid;
 
 /// Most participants, and most matches of one local endpoint, that are tracked.
 const MOST: usize = 4096;

@@ -10,7 +10,7 @@ use rustdds::qos::QosPolicyId;
 use rustdds::{Duration, QosPolicies, QosPolicyBuilder};
 
 use super::Distro;
-use gleaner_transport::Guid;
+use gleaner_messages::transport::Guid;
 
 /// Most writers whose offers are recorded.
 const NOTED: usize = 64;

@@ -9,7 +9,7 @@ use rustdds::{RepresentationIdentifier, no_key};
 
 use super::state::panic_text;
 use gleaner_messages::Endian;
-use gleaner_transport::{Clock, Sink};
+use gleaner_messages::transport::{Clock, Sink};
 
 pub(super) type RawReader = no_key::SimpleDataReader<Raw, RawAdapter>;
 pub(super) type RawWriter = no_key::DataWriter<Bytes, RawAdapter>;

@@ -28,7 +28,7 @@ use super::state::{ParticipantState, panic_text};
 use super::topic_reader::{self, ReceiveContext, TopicReader};
 use super::type_query::{TypeQuerier, TypeQuery};
 use super::{DdsError, DdsOptions, discovery};
-use gleaner_transport::Clock;
+use gleaner_messages::transport::Clock;
 
 const WAKE: Token = Token(0);
 const STATUS: Token = Token(1);
@@ -36,14 +36,14 @@ const GRAPH: Token = Token(2);
 const ANSWER: Token = Token(3);
 
 /// Most samples of one topic before the next one's turn.
-const MOST_PER_TURN: usize = 64;
-/// Interval of updates: after a change, and in any case.
+const MAX_PER_TURN: usize = 64;
+/// Shortest time between two updates after changes, and longest time without an update.
 const UPDATE_MIN: Duration = Duration::from_millis(100);
 const UPDATE_MAX: Duration = Duration::from_secs(1);
 /// Shared memory for samples that is always kept.
 const SHARED_BYTES: usize = 1 << 20;
 /// Most memory that is mapped before there are samples, for all topics together, in bytes.
-pub const MOST_MAPPED: usize = 256 << 20;
+pub const MAX_MAPPED: usize = 256 << 20;
 /// Size of the blocks in which it is mapped: the allocator keeps blocks of this size, and merges
 /// them.
 const MAPPED_BLOCK: usize = 1 << 20;
@@ -227,7 +227,7 @@ impl Receiver {
     /// to reuse: a page is new to the process only once.
     fn map_memory(&mut self) {
         let each = self.readers.values().map(TopicReader::memory_needed);
-        let needed = each.fold(0, usize::saturating_add).min(MOST_MAPPED);
+        let needed = each.fold(0, usize::saturating_add).min(MAX_MAPPED);
         if self.real_time && needed > self.mapped {
             self.mapped = needed;
             // At once, since memory that is freed between would be mapped again and again. Zeros
@@ -268,7 +268,7 @@ impl Receiver {
             clock: self.clock,
         };
         for reader in self.readers.values_mut().filter(|reader| reader.ready) {
-            reader.take(&context, MOST_PER_TURN);
+            reader.take(&context, MAX_PER_TURN);
         }
     }
 

@@ -5,7 +5,7 @@
 //! Even a signal without a handler interrupts a wait: an ignored SIGCHLD is delivered to another
 //! thread while the first one is about to start a process. A stop of the whole process (SIGSTOP, a
 //! debugger, a frozen container, suspend) cannot be blocked;
-//! [`Health::dead`](gleaner_transport::Health::dead) reports its effect.
+//! [`Health::dead`](gleaner_messages::transport::Health::dead) reports its effect.
 
 use nix::sys::signal::{SigSet, SigmaskHow, Signal};
 

@@ -11,7 +11,7 @@ use super::peers::Peers;
 use super::type_check::TopicLayout;
 use super::type_query::QueryOutcome;
 use super::{Distro, names};
-use gleaner_transport::{Guid, ReceptionStatus};
+use gleaner_messages::transport::{Guid, ReceptionStatus};
 
 pub(super) const UNKNOWN: u64 = u64::MAX;
 

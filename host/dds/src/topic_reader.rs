@@ -17,18 +17,18 @@ use super::qos::{Offer, Request, describe};
 use super::raw::{CopiedTo, CopyInto, CopyOrReport, Raw, RawReader};
 use super::state::{OnceLog, ParticipantState, SubscriptionStatus, UNKNOWN, lock, panic_text};
 use super::type_check::{LeftOut, TypeCheck};
-use gleaner_transport::{Clock, Gaps, Guid, Qos, SampleMeta, Sink, TopicSpec};
+use gleaner_messages::transport::{Clock, Gaps, Guid, Qos, SampleMeta, Sink, TopicSpec};
 
 /// Memory and number of samples that RustDDS may keep for a topic: it frees a sample when newer
 /// ones have taken its place, not when it is taken.
 const KEPT_BYTES: usize = 64 << 20;
 const KEPT: std::ops::RangeInclusive<usize> = 4..=1024;
 /// Hard caps on the queue, whatever the subscription requests.
-const MOST_KEPT_BYTES: usize = 1 << 30;
-const MOST_KEPT: usize = 65_536;
+const MAX_KEPT_BYTES: usize = 1 << 30;
+const MAX_KEPT: usize = 65_536;
 /// Most warnings about writers in the status, and most past re-subscriptions besides.
-const MOST_WARNINGS: usize = 10;
-const MOST_RESUBSCRIBED: usize = 4;
+const MAX_WARNINGS: usize = 10;
+const MAX_RESUBSCRIBED: usize = 4;
 
 /// The token of the first reader.
 const FIRST: usize = 16;
@@ -93,7 +93,7 @@ pub(super) fn kept(spec: &TopicSpec) -> usize {
         Qos::Fixed { depth, .. } => spec.queue.max(depth),
         Qos::Auto => spec.queue,
     };
-    let most_kept = (MOST_KEPT_BYTES / bytes).clamp(least, MOST_KEPT);
+    let most_kept = (MAX_KEPT_BYTES / bytes).clamp(least, MAX_KEPT);
     asked.min(most_kept).max((KEPT_BYTES / bytes).clamp(least, most))
 }
 
@@ -126,7 +126,6 @@ impl TopicReader {
         })
     }
 
-    /// Number of the subscription.
     pub(super) fn index(&self) -> usize {
         self.index
     }
@@ -318,7 +317,7 @@ impl TopicReader {
         let left_out = others
             .iter()
             .map(|(offer, why)| why.warning(offer, (topic, &self.type_name), &self.status.layout));
-        let mut qos_warnings: Vec<_> = left_out.take(MOST_WARNINGS / 2).collect();
+        let mut qos_warnings: Vec<_> = left_out.take(MAX_WARNINGS / 2).collect();
         let Some(request) = self.request else { return qos_warnings };
         for offer in same {
             if let Some(shortfall) = offer.shortfall(request) {
@@ -338,7 +337,7 @@ impl TopicReader {
             );
             qos_warnings.push(("differ", sentence));
         }
-        qos_warnings.truncate(MOST_WARNINGS);
+        qos_warnings.truncate(MAX_WARNINGS);
         qos_warnings
     }
 
@@ -363,7 +362,7 @@ impl TopicReader {
                 "`{topic}` was re-subscribed with {wanted} instead of {now}: \
                  writer {writer} offers {offered}"
             );
-            if self.resubscribed.len() == MOST_RESUBSCRIBED {
+            if self.resubscribed.len() == MAX_RESUBSCRIBED {
                 self.resubscribed.remove(0);
             }
             self.resubscribed.push(sentence);
@@ -391,7 +390,7 @@ impl TopicReader {
             return;
         }
         if self.reader.is_some() {
-            self.take(context, MOST_KEPT);
+            self.take(context, MAX_KEPT);
             self.read_before = self.gaps.clone();
             self.remove_reader(context.registry, context.state);
         } else if !request.transient_local {
@@ -465,7 +464,7 @@ mod tests {
     #[test]
     fn no_queue_takes_more_than_a_gibibyte() {
         assert_eq!(kept(&spec(usize::MAX, 25 << 20)), 40);
-        assert_eq!(kept(&spec(usize::MAX, 1)), MOST_KEPT);
+        assert_eq!(kept(&spec(usize::MAX, 1)), MAX_KEPT);
         assert_eq!(kept(&spec(usize::MAX, usize::MAX)), 4);
     }
 

@@ -9,10 +9,10 @@ use rustdds::DomainParticipant;
 use super::discovery;
 use super::names::{ros_type, visible};
 use super::qos::Offer;
-use gleaner_transport::{Guid, SampleMeta};
+use gleaner_messages::transport::{Guid, SampleMeta};
 
 /// Most writers that are remembered as left out.
-const MOST_LEFT_OUT: usize = 1024;
+const MAX_LEFT_OUT: usize = 1024;
 /// Last byte of the GUID of a program's writer with a key (RTPS 2.5, 9.3.1.2).
 const WITH_KEY: u8 = 0x02;
 
@@ -152,7 +152,7 @@ impl TypeCheck {
             }
         }
         self.received = received.iter().map(|offer| (offer.guid, number_of(offer))).collect();
-        if self.left_out.len() > MOST_LEFT_OUT {
+        if self.left_out.len() > MAX_LEFT_OUT {
             self.left_out.clear();
         }
         // Writers that are gone stay: samples that they sent before may still be queued.

@@ -29,8 +29,8 @@ use super::qos::{Offer, Request};
 use super::raw::{CopyInto, RawReader, RawWriter};
 use super::topic_reader::ReceiveContext;
 use gleaner_messages::Endian;
+use gleaner_messages::transport::Guid;
 use gleaner_messages::type_description::{RequestHeader, request};
-use gleaner_transport::Guid;
 
 /// Time limit of a query, from the search for a node to its answer.
 const LIMIT: Duration = Duration::from_secs(2);

@@ -8,7 +8,7 @@ use super::sockets::{Queues, Sockets, busy, gone};
 use super::state::ParticipantState;
 
 /// Consecutive checks without progress after which the participant is dead.
-const MOST_STALLED: u32 = 10;
+const MAX_STALLED: u32 = 10;
 /// Checks that follow each other faster than this count as one.
 const SPACING: Duration = Duration::from_millis(900);
 
@@ -75,15 +75,15 @@ impl Watchdog {
         if let Some(thread) = gone(&self.threads) {
             return Some(format!("thread {thread} of RustDDS is gone"));
         }
-        if self.delivering >= MOST_STALLED {
+        if self.delivering >= MAX_STALLED {
             let topic = self.delivery.and_then(|(_, index)| topic(index)).unwrap_or("?");
             return Some(format!(
-                "the sink of topic `{topic}` has held a sample for {MOST_STALLED} s"
+                "the sink of topic `{topic}` has held a sample for {MAX_STALLED} s"
             ));
         }
         let bytes = self.queues.waiting;
-        (self.waiting >= MOST_STALLED).then(|| {
-            format!("{bytes} bytes wait in sockets, and nothing was received for {MOST_STALLED} s")
+        (self.waiting >= MAX_STALLED).then(|| {
+            format!("{bytes} bytes wait in sockets, and nothing was received for {MAX_STALLED} s")
         })
     }
 }

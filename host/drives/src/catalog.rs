@@ -6,12 +6,14 @@ use std::sync::{Arc, OnceLock};
 
 use tracing::warn;
 
-use super::file::{ChannelInfo, Contents};
+use crate::file::{ChannelInfo, Contents};
 use gleaner_base::excerpt;
 use gleaner_base::text::nearest;
+use gleaner_messages::transport::{
+    DiscoveredTopic, TopicSpec, TransportError, latched_depth, same_type,
+};
 use gleaner_messages::type_description::type_hash;
 use gleaner_messages::{Definitions, Sources, SourcesError, short_name};
-use gleaner_transport::{DiscoveredTopic, TopicSpec, TransportError, latched_depth, same_type};
 
 const LAYOUTS_MAX: usize = 64;
 
@@ -24,11 +26,11 @@ const OTHER_HASH: &str = "a channel states a type hash that is not that of its d
     installed";
 
 #[derive(Copy, Clone)]
-pub(super) struct DriveChannel {
-    pub(super) file: usize,
-    pub(super) id: u16,
+pub struct DriveChannel {
+    pub file: usize,
+    pub id: u16,
     /// Number of the layout of its messages among those of its topic.
-    pub(super) layout: u16,
+    pub layout: u16,
 }
 
 /// A topic of all files, as far as it has one type.
@@ -176,24 +178,24 @@ impl DriveTopic {
         }
         if self.foreign_text.is_some() && !layouts.texts.is_empty() {
             return Some(
-                "some of its definitions are no ros2msg text, others are; replay the files with \
+                "some of its definitions are not ros2msg text, others are; replay the files with \
                  each kind separately",
             );
         }
         (self.lacks_text && layouts.texts.len() > 1).then_some(
             "the files define its type in several ways, and some of its messages do not state \
-             theirs; replay the files separately",
+             which; replay the files separately",
         )
     }
 }
 
-pub(super) struct Selected<'a> {
+pub struct Selected<'a> {
     /// In the order of files and ids.
-    pub(super) channels: &'a [DriveChannel],
-    pub(super) messages: Option<u64>,
+    pub channels: &'a [DriveChannel],
+    pub messages: Option<u64>,
 }
 
-pub(super) struct Catalog {
+pub struct Catalog {
     /// One entry for each type of a topic, that with the most messages first.
     by_name: BTreeMap<String, Vec<DriveTopic>>,
     /// The sources of definitions that the files do not carry.
@@ -201,7 +203,7 @@ pub(super) struct Catalog {
 }
 
 impl Catalog {
-    pub(super) fn build(files: &[(&Path, &Contents)], sources: Option<Sources>) -> Self {
+    pub fn build(files: &[(&Path, &Contents)], sources: Option<Sources>) -> Self {
         let mut channels = Vec::new();
         for (file, (_, contents)) in files.iter().enumerate() {
             for (id, channel) in contents.channels.iter() {
@@ -231,7 +233,7 @@ impl Catalog {
         Self { by_name, sources }
     }
 
-    pub(super) fn topics(&self) -> Vec<DiscoveredTopic> {
+    pub fn topics(&self) -> Vec<DiscoveredTopic> {
         let discovered = |name: &String, topic: &DriveTopic| DiscoveredTopic {
             topic: name.clone(),
             type_name: topic.type_name.clone(),
@@ -273,22 +275,16 @@ impl Catalog {
     }
 
     /// Returns the channels of a topic, if it matches `spec`.
-    pub(super) fn select(&self, spec: &TopicSpec) -> Result<Selected<'_>, TransportError> {
+    pub fn select(&self, spec: &TopicSpec) -> Result<Selected<'_>, TransportError> {
         let topic = self.get(&spec.topic, Some(&spec.type_name))?;
+        let name = || spec.topic.clone();
         if !same_type(&topic.type_name, &spec.type_name) {
-            return Err(TransportError::WrongType {
-                topic: spec.topic.clone(),
-                wanted: spec.type_name.clone(),
-                found: topic.type_name.clone(),
-            });
+            let (wanted, found) = (spec.type_name.clone(), topic.type_name.clone());
+            return Err(TransportError::WrongType { topic: name(), wanted, found });
         }
         let encoding = |what, found: &String, wanted| {
-            Err(TransportError::Encoding {
-                topic: spec.topic.clone(),
-                what,
-                found: found.clone(),
-                wanted,
-            })
+            let found = found.clone();
+            Err(TransportError::Encoding { topic: name(), what, found, wanted })
         };
         if let Some(found) = &topic.foreign {
             return encoding("message encoding", found, "cdr");
@@ -299,19 +295,19 @@ impl Catalog {
             return encoding("schema encoding", found, "ros2msg");
         }
         if let Some(why) = topic.unknown_layout() {
-            return Err(TransportError::UnknownLayout { topic: spec.topic.clone(), why });
+            return Err(TransportError::UnknownLayout { topic: name(), why });
         }
         Ok(Selected { channels: &topic.channels, messages: topic.messages })
     }
 
     /// Returns whether the writers of a topic keep samples for readers that come later.
-    pub(super) fn is_latched(&self, spec: &TopicSpec) -> bool {
+    pub fn is_latched(&self, spec: &TopicSpec) -> bool {
         let topic = self.get(&spec.topic, Some(&spec.type_name)).ok();
         topic.and_then(|topic| latched_depth(topic.offered_qos.as_deref()?)).is_some()
     }
 
     /// Warns if messages of other types than that of `spec` are left out of its topic.
-    pub(super) fn warn_of_other_types(&self, spec: &TopicSpec) {
+    pub fn warn_of_other_types(&self, spec: &TopicSpec) {
         let topics = self.by_name.get(&spec.topic).map_or(&[][..], Vec::as_slice);
         let others = topics.iter().filter(|other| !same_type(&other.type_name, &spec.type_name));
         let others: Vec<_> = others.filter(|other| other.messages != Some(0)).collect();
@@ -326,13 +322,13 @@ impl Catalog {
             left_out = %names.collect::<Vec<_>>().join(", "),
             types = others.len(),
             messages,
-            "a topic has messages of other types, which are left out"
+            "skipped the messages of other types in a topic"
         );
     }
 
     /// Returns the definitions of a topic; if it has several types, those of `type_name`, or of the
     /// one with the most messages.
-    pub(super) fn definitions(
+    pub fn definitions(
         &self,
         name: &str,
         type_name: Option<&str>,

@@ -4,45 +4,28 @@ use std::io::{self, Read};
 
 use zstd::stream::raw::{Decoder as ZstdDecoder, Operation};
 
-use super::damage::Damage;
-use super::error::ReplayError;
-use super::file::Channels;
-use super::options::{DriveLimits, Span};
-use super::records::{ChunkHead, HEAD, McapRecord, MessageHead, Records, op};
-use super::source::SourceFile;
-
-/// Position of a chunk, or of a run of messages outside chunks, in a file.
-pub(super) struct FileSegment {
-    /// Offset of the head of the first record.
-    pub(super) offset: u64,
-    /// Length of all its records, including their heads.
-    pub(super) len: u64,
-    pub(super) start_time: u64,
-    pub(super) end_time: u64,
-    pub(super) kind: SegmentKind,
-    /// The channels with messages in it, if known.
-    pub(super) channels: Option<Box<[u16]>>,
-}
-
-#[derive(Copy, Clone, PartialEq, Eq)]
-pub(super) enum SegmentKind {
-    Chunk,
-    Run,
-}
+use crate::damage::Damage;
+use crate::error::ReplayError;
+use crate::file::{Channels, FileSegment, SegmentKind};
+use crate::options::{DriveLimits, Span};
+#[cfg(feature = "bags")]
+use crate::records::MESSAGE_HEAD;
+use crate::records::{ChunkHead, HEAD, McapRecord, MessageHead, Records, op};
+use crate::source::SourceFile;
 
 /// One message of an open segment, in the order of delivery.
 #[derive(Copy, Clone, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) struct MessageEntry {
-    pub(super) log_time: u64,
+pub struct MessageEntry {
+    pub log_time: u64,
     /// 0 in a segment of a database, whose order does not depend on channels.
-    pub(super) channel: u16,
+    pub channel: u16,
     /// Offset of the message record's body in [`OpenSegment::bytes`]; its length precedes it.
     at: u32,
 }
 
 /// A segment in memory. Its buffers are reused for the next one.
 #[derive(Default)]
-pub(super) struct OpenSegment {
+pub struct OpenSegment {
     /// The records; bytes beyond `len` are of an earlier, longer segment.
     bytes: Vec<u8>,
     len: usize,
@@ -56,18 +39,18 @@ pub(super) struct OpenSegment {
 impl OpenSegment {
     /// Returns the next message to deliver.
     #[inline]
-    pub(super) fn head(&self) -> Option<MessageEntry> {
+    pub fn head(&self) -> Option<MessageEntry> {
         self.entries.get(self.next).copied()
     }
 
     #[inline]
-    pub(super) fn advance(&mut self) {
+    pub fn advance(&mut self) {
         self.next += 1;
     }
 
     /// Returns the body of a message record of this segment.
     #[inline]
-    pub(super) fn body(&self, entry: MessageEntry) -> &[u8] {
+    pub fn body(&self, entry: MessageEntry) -> &[u8] {
         let at = entry.at as usize;
         // `sort` took `at` from a record that is within `bytes`, with its length.
         let len = self.bytes[..at].last_chunk().map_or(0, |len| u64::from_le_bytes(*len));
@@ -75,17 +58,17 @@ impl OpenSegment {
     }
 
     /// Returns the size of the records, in bytes.
-    pub(super) fn len(&self) -> usize {
+    pub fn len(&self) -> usize {
         self.len
     }
 
-    pub(super) fn records(&self) -> Records<'_> {
+    pub fn records(&self) -> Records<'_> {
         Records::new(&self.bytes[..self.len])
     }
 
     /// Clears the segment, for messages that [`OpenSegment::push`] adds.
     #[cfg(feature = "bags")]
-    pub(super) fn clear(&mut self) {
+    pub fn clear(&mut self) {
         (self.len, self.next) = (0, 0);
         self.bytes.clear();
         self.entries.clear();
@@ -94,13 +77,12 @@ impl OpenSegment {
     /// Adds a message after all others, as an MCAP record. Of equal times, the one added first
     /// comes first.
     #[cfg(feature = "bags")]
-    pub(super) fn push(&mut self, head: &MessageHead, data: &[u8]) {
+    pub fn push(&mut self, head: &MessageHead, data: &[u8]) {
         // It fits: messages of a database are limited to the size of a segment, and fill one with
         // little more.
         let at = (self.bytes.len() + HEAD as usize) as u32;
         self.bytes.push(op::MESSAGE);
-        self.bytes
-            .extend_from_slice(&((super::records::MESSAGE_HEAD + data.len()) as u64).to_le_bytes());
+        self.bytes.extend_from_slice(&((MESSAGE_HEAD + data.len()) as u64).to_le_bytes());
         self.bytes.extend_from_slice(&head.to_bytes());
         self.bytes.extend_from_slice(data);
         self.len = self.bytes.len();
@@ -108,7 +90,7 @@ impl OpenSegment {
     }
 
     /// Takes the channels of messages whose time is too late; one entry for each message.
-    pub(super) fn take_late(&mut self) -> Vec<u16> {
+    pub fn take_late(&mut self) -> Vec<u16> {
         std::mem::take(&mut self.late)
     }
 
@@ -160,26 +142,26 @@ impl OpenSegment {
     }
 }
 
-pub(super) fn message_head(body: &[u8]) -> Result<MessageHead, Damage> {
+pub fn message_head(body: &[u8]) -> Result<MessageHead, Damage> {
     MessageHead::parse(body).ok_or(Damage::Malformed("a message record is shorter than its header"))
 }
 
 /// Reads segments; keeps the decompressor's state between them.
-pub(super) struct Opener {
+pub struct Opener {
     limits: DriveLimits,
     zstd: Option<ZstdDecoder<'static>>,
     compressed: Vec<u8>,
 }
 
 impl Opener {
-    pub(super) fn new(limits: DriveLimits) -> Self {
+    pub fn new(limits: DriveLimits) -> Self {
         // Positions in a segment have 32 bits.
         let limits = DriveLimits { chunk_bytes: limits.chunk_bytes.min(1 << 31), ..limits };
         Self { limits, zstd: None, compressed: Vec::new() }
     }
 
     /// Reads a segment into `into` and sorts the wanted messages of `span` in it.
-    pub(super) fn open(
+    pub fn open(
         &mut self,
         source: &mut SourceFile,
         segment: &FileSegment,
@@ -194,7 +176,7 @@ impl Opener {
     }
 
     /// Reads a segment's records into `into`, unsorted.
-    pub(super) fn read(
+    pub fn read(
         &mut self,
         source: &mut SourceFile,
         offset: u64,

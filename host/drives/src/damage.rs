@@ -51,7 +51,7 @@ pub enum Damage {
     #[error("a chunk claims {claimed} bytes; at most {allowed} are allowed")]
     ChunkTooLarge {
         claimed: u64,
-        /// [`super::DriveLimits::chunk_bytes`].
+        /// [`crate::DriveLimits::chunk_bytes`].
         allowed: u64,
     },
     #[error("a chunk is compressed with `{0}`; only zstd and lz4 can be read")]
@@ -73,7 +73,7 @@ pub enum Damage {
     },
     #[error("its metadata and attachments take more than {allowed} bytes")]
     ExtrasTooLarge {
-        /// The limit given to [`super::read_extras`].
+        /// The limit given to [`crate::read_extras`].
         allowed: u64,
     },
     #[error("the file should have {expected} {what}; {found} were found")]
@@ -86,7 +86,7 @@ pub enum Damage {
     #[error("a message of topic `{topic}` is more than {allowed} bytes once unpacked")]
     MessageTooLarge {
         topic: String,
-        /// [`super::DriveLimits::chunk_bytes`].
+        /// [`crate::DriveLimits::chunk_bytes`].
         allowed: u64,
     },
     #[error("a message of topic `{topic}` cannot be unpacked")]

@@ -19,12 +19,12 @@ use rusqlite::limits::Limit;
 use rusqlite::{Connection, OpenFlags, OptionalExtension};
 use tracing::warn;
 
-use super::damage::Damage;
-use super::error::ReplayError;
-use super::file::{ChannelInfo, Channels, Contents, offered_qos};
-use super::options::DriveLimits;
-use super::rows::{LATER, MessageRows, SAME_TIME, is_of_system, select, time};
-use super::storage::journals_of;
+use crate::bag::journals_of;
+use crate::damage::Damage;
+use crate::error::ReplayError;
+use crate::file::{ChannelInfo, Channels, Contents, offered_qos};
+use crate::options::DriveLimits;
+use crate::rows::{LATER, MessageRows, SAME_TIME, is_of_system, select, time, unreadable};
 
 type BoxedError = Box<dyn Error + Send + Sync>;
 
@@ -44,7 +44,7 @@ const HASH: &str = "type_description_hash";
 const ROW_BYTES: usize = 128;
 
 #[derive(Copy, Clone)]
-pub(super) struct DatabaseFile<'a> {
+pub struct DatabaseFile<'a> {
     shown: &'a Path,
     real: &'a Path,
     /// Set if there may be a journal beside it.
@@ -52,17 +52,17 @@ pub(super) struct DatabaseFile<'a> {
 }
 
 impl<'a> DatabaseFile<'a> {
-    pub(super) fn beside_its_journal(path: &'a Path) -> Self {
+    pub fn beside_its_journal(path: &'a Path) -> Self {
         Self { shown: path, real: path, may_be_open: true }
     }
 
     /// Describes the content of `shown`, which was copied to `real`.
-    pub(super) fn elsewhere(shown: &'a Path, real: &'a Path) -> Self {
+    pub fn elsewhere(shown: &'a Path, real: &'a Path) -> Self {
         Self { shown, real, may_be_open: false }
     }
 }
 
-pub(super) fn open(
+pub fn open(
     file: DatabaseFile<'_>,
     len: u64,
     limits: DriveLimits,
@@ -92,12 +92,8 @@ pub(super) fn open(
     let last = edge(&db, &index, "DESC").ok().flatten();
     let mut contents =
         Contents { channels: known.channels, uncounted: true, ..Contents::default() };
-    contents.times = first
-        .as_ref()
-        .ok()
-        .copied()
-        .flatten()
-        .map(|first| (first, last.unwrap_or(first).max(first)));
+    let known_first = first.as_ref().ok().copied().flatten();
+    contents.times = known_first.map(|first| (first, last.unwrap_or(first).max(first)));
     if is_cut_off {
         warn!(
             path = %path.display(),
@@ -344,9 +340,8 @@ fn table(db: &Connection, name: &str, wanted: &[&str]) -> Result<Vec<String>, Bo
         Some("table") => {}
         Some(_) => return Err(format!("its `{name}` is not a plain table").into()),
         None => {
-            return Err(
-                format!("it has no table `{name}`, so it is not a database of rosbag2").into()
-            );
+            let why = format!("it has no table `{name}`, so it is not a database of rosbag2");
+            return Err(why.into());
         }
     }
     // Computed columns are hidden ones.
@@ -416,7 +411,6 @@ fn edge_sql(index: &str, order: &str) -> String {
 
 /// Returns the first or the last time; `None` if there are no messages.
 fn edge(db: &Connection, index: &str, order: &str) -> Result<Option<u64>, Damage> {
-    let unreadable = |error: rusqlite::Error| Damage::Database(error.into());
     let mut statement = db.prepare(&edge_sql(index, order)).map_err(unreadable)?;
     let mut rows = statement.query([]).map_err(unreadable)?;
     let Some(row) = rows.next().map_err(unreadable)? else {

@@ -10,18 +10,18 @@ use std::sync::Arc;
 
 use latched::EarlierSample;
 
-use super::catalog::Catalog;
-use super::chunk::{OpenSegment, Opener};
-use super::damage::Damage;
-use super::error::ReplayError;
-use super::inflate::Inflate;
-use super::options::{DriveLimits, DriveOptions, Span};
-use super::separate::drives_of;
-use super::step::{Progress, ReplayStep};
-use super::storage;
-use super::track::{Routed, Track, nanoseconds};
+use crate::catalog::Catalog;
+use crate::chunk::{OpenSegment, Opener};
+use crate::damage::Damage;
+use crate::error::ReplayError;
+use crate::inflate::Inflate;
+use crate::options::{DriveLimits, DriveOptions, Span};
+use crate::separate::drives_of;
+use crate::step::{Progress, ReplayStep};
+use crate::storage;
+use crate::track::{Routed, Track, nanoseconds};
 use gleaner_messages::Definitions;
-use gleaner_transport::{
+use gleaner_messages::transport::{
     Delivery, DiscoveredTopic, Sink, Subscription, TopicSpec, Transport, TransportError,
 };
 use tracing::warn;
@@ -476,7 +476,7 @@ fn leave_out(counts: &mut BTreeMap<String, u64>, track: &mut Track, channel: u16
     match counts.get_mut(&topic) {
         Some(count) => *count += 1,
         None => {
-            warn!(%path, topic, why, "a message is left out; further ones of its topic are counted");
+            warn!(%path, topic, why, "skipped a message; more of its topic are only counted");
             counts.insert(topic, 1);
         }
     }

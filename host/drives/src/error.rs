@@ -4,7 +4,7 @@ use std::error::Error;
 use std::io;
 use std::path::{Path, PathBuf};
 
-use super::damage::{Damage, DamageLocation};
+use crate::damage::{Damage, DamageLocation};
 use gleaner_base::Exit;
 
 /// Reasons why a drive cannot be opened, or ends early.
@@ -39,7 +39,7 @@ pub enum ReplayError {
     #[error("with drive `{path}`, the packed files hold more than {allowed} bytes")]
     UnpacksTooLarge {
         path: PathBuf,
-        /// [`super::DriveLimits::unpacked_bytes`].
+        /// [`crate::DriveLimits::unpacked_bytes`].
         allowed: u64,
     },
     #[error(
@@ -78,7 +78,7 @@ pub enum ReplayError {
     /// The system failed to read the file; the file itself may be intact.
     #[error("cannot read drive `{path}` at byte {offset}")]
     Read { path: PathBuf, offset: u64, source: io::Error },
-    /// The file is damaged. All messages that [`super::Replay`] promises were delivered before.
+    /// The file is damaged. All messages that [`crate::Replay`] promises were delivered before.
     #[error("drive `{path}` is damaged at {at}")]
     Damaged {
         path: PathBuf,

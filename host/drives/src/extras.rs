@@ -5,12 +5,12 @@ use std::path::Path;
 
 use tracing::warn;
 
-use super::damage::Damage;
-use super::error::ReplayError;
-use super::indexes::{INDEX_BYTES, Indexes};
-use super::records::{self, HEAD, MAGIC, Statistics, head, op};
-use super::source::SourceFile;
-use super::summary::footer;
+use crate::damage::Damage;
+use crate::error::ReplayError;
+use crate::indexes::{INDEX_BYTES, Indexes};
+use crate::records::{self, HEAD, MAGIC, Statistics, head, op};
+use crate::source::SourceFile;
+use crate::summary::footer;
 
 /// Approximate size of a text, a pair or a list entry, besides its bytes. Without it, a file of
 /// tiny entries would take many times its size.

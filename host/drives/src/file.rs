@@ -6,33 +6,32 @@ use std::sync::Arc;
 
 use tracing::warn;
 
-use super::chunk::FileSegment;
-use super::damage::Damage;
-use super::records::{McapChannel, McapSchema, op};
-use gleaner_transport::Guid;
+use crate::damage::Damage;
+use crate::records::{McapChannel, McapSchema, op};
+use gleaner_messages::transport::Guid;
 
-pub(super) struct ChannelInfo {
-    pub(super) topic: String,
+pub struct ChannelInfo {
+    pub topic: String,
     /// Empty if the channel has no schema.
-    pub(super) type_name: String,
-    pub(super) message_encoding: String,
-    pub(super) schema_encoding: String,
-    pub(super) definitions_text: Option<Arc<str>>,
-    pub(super) offered_qos: Option<String>,
+    pub type_name: String,
+    pub message_encoding: String,
+    pub schema_encoding: String,
+    pub definitions_text: Option<Arc<str>>,
+    pub offered_qos: Option<String>,
     /// The writer of its messages, if the file names it. Clips do.
-    pub(super) writer: Option<Guid>,
+    pub writer: Option<Guid>,
     /// True for samples from before a clip. Clips state it.
-    pub(super) is_latched: bool,
+    pub is_latched: bool,
     /// RIHS01 of its type, as its writer announced it.
-    pub(super) type_hash: Option<String>,
+    pub type_hash: Option<String>,
     /// The reason why the layout of its messages is unknown, although definitions were found.
-    pub(super) unknown_layout: Option<&'static str>,
+    pub unknown_layout: Option<&'static str>,
 }
 
 #[cfg(feature = "bags")]
 impl ChannelInfo {
     /// Returns the size of its texts, without the definitions, which channels share.
-    pub(super) fn bytes(&self) -> usize {
+    pub fn bytes(&self) -> usize {
         let texts = [&self.topic, &self.type_name, &self.message_encoding, &self.schema_encoding];
         texts
             .into_iter()
@@ -51,7 +50,7 @@ struct SchemaInfo {
 
 /// The channels of a file that are known so far.
 #[derive(Default)]
-pub(super) struct Channels {
+pub struct Channels {
     schemas: HashMap<u16, SchemaInfo>,
     by_id: HashMap<u16, ChannelInfo>,
     /// Size in bytes of the schemas and channels that were kept.
@@ -68,29 +67,29 @@ const SHOWN_CHARS: usize = 100;
 const TOO_MUCH: Damage = Damage::Malformed("its schemas and channels take more than 64 MiB");
 
 impl Channels {
-    pub(super) fn len(&self) -> usize {
+    pub fn len(&self) -> usize {
         self.by_id.len()
     }
 
-    pub(super) fn get(&self, id: u16) -> Option<&ChannelInfo> {
+    pub fn get(&self, id: u16) -> Option<&ChannelInfo> {
         self.by_id.get(&id)
     }
 
     /// Returns all channels by id, so that everything derived from them has one order.
-    pub(super) fn iter(&self) -> impl Iterator<Item = (u16, &ChannelInfo)> {
+    pub fn iter(&self) -> impl Iterator<Item = (u16, &ChannelInfo)> {
         let mut all: Vec<_> = self.by_id.iter().map(|(id, info)| (*id, info)).collect();
         all.sort_unstable_by_key(|(id, _)| *id);
         all.into_iter()
     }
 
     #[cfg(feature = "bags")]
-    pub(super) fn add(&mut self, id: u16, info: ChannelInfo) -> Result<(), Damage> {
+    pub fn add(&mut self, id: u16, info: ChannelInfo) -> Result<(), Damage> {
         self.make_room(info.bytes() + info.definitions_text.as_ref().map_or(0, |text| text.len()))?;
         self.by_id.insert(id, info);
         Ok(())
     }
 
-    pub(super) fn make_room(&mut self, bytes: usize) -> Result<(), Damage> {
+    pub fn make_room(&mut self, bytes: usize) -> Result<(), Damage> {
         self.bytes = self.bytes.saturating_add(bytes);
         if self.bytes > KNOWN_BYTES { Err(TOO_MUCH) } else { Ok(()) }
     }
@@ -98,7 +97,7 @@ impl Channels {
     /// Adds a schema or channel record; other records are skipped. Writers repeat schemas and
     /// channels, always with the same content: a different repetition is damage, since messages
     /// would change their topic or their type.
-    pub(super) fn learn(&mut self, opcode: u8, body: &[u8]) -> Result<(), Damage> {
+    pub fn learn(&mut self, opcode: u8, body: &[u8]) -> Result<(), Damage> {
         match opcode {
             op::SCHEMA => {
                 let schema = schema_of(body)?;
@@ -140,7 +139,7 @@ impl Channels {
 
     /// Compares a record with known ones; other records, and unknown schemas and channels, are
     /// skipped.
-    pub(super) fn check(&self, opcode: u8, body: &[u8]) -> Result<(), Damage> {
+    pub fn check(&self, opcode: u8, body: &[u8]) -> Result<(), Damage> {
         match opcode {
             op::SCHEMA => {
                 let schema = schema_of(body)?;
@@ -247,7 +246,7 @@ fn redefined(
 }
 
 /// Returns the QoS of a topic's writers as rosbag2 wrote it; one that is too long is skipped.
-pub(super) fn offered_qos(topic: &str, found: Option<&str>) -> Option<String> {
+pub fn offered_qos(topic: &str, found: Option<&str>) -> Option<String> {
     let found = found.filter(|text| !text.is_empty())?;
     if found.len() > QOS_BYTES {
         warn!(topic, bytes = found.len(), "offered_qos_profiles is longer than 64 KiB; skipped");
@@ -256,28 +255,47 @@ pub(super) fn offered_qos(topic: &str, found: Option<&str>) -> Option<String> {
     Some(found.to_owned())
 }
 
+/// Position of a chunk, or of a run of messages outside chunks, in a file.
+pub struct FileSegment {
+    /// Offset of the head of the first record.
+    pub offset: u64,
+    /// Length of all its records, including their heads.
+    pub len: u64,
+    pub start_time: u64,
+    pub end_time: u64,
+    pub kind: SegmentKind,
+    /// The channels with messages in it, if known.
+    pub channels: Option<Box<[u16]>>,
+}
+
+#[derive(Copy, Clone, PartialEq, Eq)]
+pub enum SegmentKind {
+    Chunk,
+    Run,
+}
+
 #[derive(Default)]
-pub(super) struct Contents {
-    pub(super) channels: Channels,
+pub struct Contents {
+    pub channels: Channels,
     /// In file order.
-    pub(super) segments: Vec<FileSegment>,
+    pub segments: Vec<FileSegment>,
     /// Number of messages per channel: from the summary, or counted.
-    pub(super) messages: HashMap<u16, u64>,
+    pub messages: HashMap<u16, u64>,
     /// Set if they are unknown.
-    pub(super) uncounted: bool,
+    pub uncounted: bool,
     /// Set if `messages` is a claim of the summary, to be checked against the delivered messages.
-    pub(super) claimed: bool,
+    pub claimed: bool,
     /// Damage and its position; all `segments` are before it.
-    pub(super) damage: Option<(u64, Damage)>,
+    pub damage: Option<(u64, Damage)>,
     /// First and last log time, in ns, if not those of `segments`.
-    pub(super) times: Option<(u64, u64)>,
+    pub times: Option<(u64, u64)>,
     /// Set if the last log time is lost; then the second of `times` is not the last.
-    pub(super) is_end_unknown: bool,
+    pub is_end_unknown: bool,
 }
 
 impl Contents {
     /// Returns the first and last log time, in ns; times beyond the year 2262 are none.
-    pub(super) fn span(&self) -> Option<(u64, u64)> {
+    pub fn span(&self) -> Option<(u64, u64)> {
         if self.times.is_some() {
             return self.times;
         }

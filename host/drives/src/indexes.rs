@@ -3,12 +3,12 @@
 
 use std::collections::BTreeMap;
 
-use super::records::op;
+use crate::records::op;
 
 /// Maximum number of records to compare: some 60 MB of memory.
 const RECORDS_MAX: usize = 1 << 20;
 /// Bytes at the beginning of an index record with a position and a length.
-pub(super) const INDEX_BYTES: usize = 32;
+pub const INDEX_BYTES: usize = 32;
 
 /// Chunks, attachments and metadata records by position: their kind, and their length with the
 /// head.
@@ -16,7 +16,7 @@ type Places = BTreeMap<u64, (u8, u64)>;
 
 /// The positions of records in the file and in its indexes.
 #[derive(Default)]
-pub(super) struct Indexes {
+pub struct Indexes {
     held: Places,
     named: Places,
     misfit: Option<String>,
@@ -25,7 +25,7 @@ pub(super) struct Indexes {
 impl Indexes {
     /// Notes the record at `at`, which has `len` bytes with its head. For an index record, `body`
     /// has its first [`INDEX_BYTES`] bytes, or all if it is shorter.
-    pub(super) fn add(&mut self, opcode: u8, at: u64, len: u64, body: &[u8]) {
+    pub fn add(&mut self, opcode: u8, at: u64, len: u64, body: &[u8]) {
         let number =
             |from: usize| body.get(from..from + 8)?.first_chunk().copied().map(u64::from_le_bytes);
         let is_new = match opcode {
@@ -53,7 +53,7 @@ impl Indexes {
     }
 
     /// Returns the first difference; `None` in a correct file.
-    pub(super) fn misfit(self) -> Option<String> {
+    pub fn misfit(self) -> Option<String> {
         let Self { held, named, misfit } = self;
         let differs = |a: &Places, b: &Places| {
             a.iter().find(|(at, record)| b.get(at) != Some(record)).map(|(at, _)| *at)

@@ -5,12 +5,12 @@ use std::io;
 use zstd::stream::raw::{Decoder, Operation};
 
 /// First bytes of a zstd frame. No CDR begins so: its first byte is 0.
-pub(super) const ZSTD: [u8; 4] = [0x28, 0xb5, 0x2f, 0xfd];
+pub const ZSTD: [u8; 4] = [0x28, 0xb5, 0x2f, 0xfd];
 /// Initial memory for a small message, in bytes.
 const SMALL: usize = 4 << 10;
 
 /// Unpacks messages into memory that is reused.
-pub(super) struct Inflate {
+pub struct Inflate {
     allowed: u64,
     decoder: Option<Decoder<'static>>,
     bytes: Vec<u8>,
@@ -19,25 +19,25 @@ pub(super) struct Inflate {
 
 impl Inflate {
     /// Creates an unpacker for messages of fewer than `allowed` bytes.
-    pub(super) fn new(allowed: u64) -> Self {
+    pub fn new(allowed: u64) -> Self {
         Self { allowed, decoder: None, bytes: Vec::new(), len: 0 }
     }
 
-    pub(super) fn allowed(&self) -> u64 {
+    pub fn allowed(&self) -> u64 {
         self.allowed
     }
 
     /// Returns whether the last unpacked message is larger than allowed.
-    pub(super) fn is_full(&self) -> bool {
+    pub fn is_full(&self) -> bool {
         self.len as u64 >= self.allowed
     }
 
-    pub(super) fn bytes(&self) -> &[u8] {
+    pub fn bytes(&self) -> &[u8] {
         &self.bytes[..self.len]
     }
 
     /// Unpacks the first `max_bytes` bytes of `packed`, or all if there are fewer.
-    pub(super) fn unpack(&mut self, mut packed: &[u8], max_bytes: usize) -> io::Result<()> {
+    pub fn unpack(&mut self, mut packed: &[u8], max_bytes: usize) -> io::Result<()> {
         let max_bytes = max_bytes.min(usize::try_from(self.allowed).unwrap_or(usize::MAX));
         let decoder = match &mut self.decoder {
             Some(decoder) => {

@@ -15,7 +15,6 @@
 //! No file is held in memory as a whole, no chunk with a wrong checksum is delivered, no message is
 //! lost silently, and nothing is written to a drive.
 
-#[cfg(feature = "bags")]
 mod bag;
 mod catalog;
 mod chunk;
@@ -44,8 +43,11 @@ mod summary;
 mod track;
 #[cfg(feature = "bags")]
 mod unpack;
+#[cfg(feature = "bags")]
+mod unpacked;
 mod writers;
 
+pub use bag::{files_of, journals_of};
 pub use damage::{Damage, DamageLocation};
 pub use drive::Replay;
 pub use error::ReplayError;
@@ -53,6 +55,7 @@ pub use extras::{Attachment, Extras, read_extras};
 pub use options::{DriveLimits, DriveOptions};
 pub use player::DrivePlayer;
 pub use step::{Progress, ReplayStep};
-pub use storage::{files_of, journals_of};
 #[cfg(feature = "bags")]
-pub use unpack::{ContentName, Unpacked, unpack};
+pub use unpack::unpack;
+#[cfg(feature = "bags")]
+pub use unpacked::{ContentName, Unpacked};

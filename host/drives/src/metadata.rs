@@ -9,15 +9,15 @@ use std::error::Error;
 use serde::Deserialize;
 
 /// Size limit of `metadata.yaml`; one of a thousand topics and files has some 500 KB.
-pub(super) const MAX_BYTES: u64 = 16 << 20;
+pub const MAX_BYTES: u64 = 16 << 20;
 /// Length limit for names of storages and compressions in errors; those of rosbag2 are shorter.
 const SHOWN_CHARS: usize = 32;
 
 #[derive(Debug, PartialEq, Eq)]
-pub(super) struct BagMetadata {
-    pub(super) files: Vec<String>,
+pub struct BagMetadata {
+    pub files: Vec<String>,
     /// Number of messages by topic, in all files.
-    pub(super) messages: BTreeMap<String, u64>,
+    pub messages: BTreeMap<String, u64>,
 }
 
 #[derive(Deserialize)]
@@ -66,7 +66,7 @@ enum MetadataError {
     NoFiles,
 }
 
-pub(super) fn read(text: &str) -> Result<BagMetadata, Box<dyn Error + Send + Sync>> {
+pub fn read(text: &str) -> Result<BagMetadata, Box<dyn Error + Send + Sync>> {
     let options = serde_saphyr::options! {
         // Writers do not use aliases; they could make a small file expand to a large one.
         budget: serde_saphyr::budget! {

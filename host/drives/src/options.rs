@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 #[cfg(feature = "bags")]
-use super::unpack::Unpacked;
+use crate::unpacked::Unpacked;
 use gleaner_messages::Sources;
 
 #[derive(Clone, Debug, Default)]
@@ -30,7 +30,7 @@ pub struct DriveLimits {
     pub chunk_bytes: u64,
     /// Bytes of open chunks beyond which no further one is opened ahead of its turn. Chunks that
     /// overlap in time are open together; past this limit their messages may come out of order,
-    /// which [`super::Replay::out_of_order`] counts.
+    /// which [`crate::Replay::out_of_order`] counts.
     pub open_bytes: u64,
     /// Disk space for the content of all packed files of a replay, in bytes. One file may take 200
     /// times its own size or a 64th of this, whichever is more, and never more than nine tenths of

@@ -5,56 +5,56 @@
 //! Ten kinds of records are few enough to parse directly. Source: the MCAP specification, version
 //! 0.
 
-use super::damage::Damage;
+use crate::damage::Damage;
 
 /// First and last bytes of every MCAP file.
-pub(super) const MAGIC: &[u8; 8] = b"\x89MCAP0\r\n";
+pub const MAGIC: &[u8; 8] = b"\x89MCAP0\r\n";
 /// Size of opcode and length, which precede every record.
-pub(super) const HEAD: u64 = 9;
+pub const HEAD: u64 = 9;
 /// Bytes of a message record before the message's data.
-pub(super) const MESSAGE_HEAD: usize = 22;
+pub const MESSAGE_HEAD: usize = 22;
 /// Footer record and closing magic.
-pub(super) const FOOTER: u64 = HEAD + 20 + 8;
+pub const FOOTER: u64 = HEAD + 20 + 8;
 
-pub(super) mod op {
-    pub(in super::super) const HEADER: u8 = 0x01;
-    pub(in super::super) const FOOTER: u8 = 0x02;
-    pub(in super::super) const SCHEMA: u8 = 0x03;
-    pub(in super::super) const CHANNEL: u8 = 0x04;
-    pub(in super::super) const MESSAGE: u8 = 0x05;
-    pub(in super::super) const CHUNK: u8 = 0x06;
-    pub(in super::super) const CHUNK_INDEX: u8 = 0x08;
-    pub(in super::super) const ATTACHMENT: u8 = 0x09;
-    pub(in super::super) const ATTACHMENT_INDEX: u8 = 0x0a;
-    pub(in super::super) const STATISTICS: u8 = 0x0b;
-    pub(in super::super) const METADATA: u8 = 0x0c;
-    pub(in super::super) const METADATA_INDEX: u8 = 0x0d;
-    pub(in super::super) const DATA_END: u8 = 0x0f;
+pub mod op {
+    pub const HEADER: u8 = 0x01;
+    pub const FOOTER: u8 = 0x02;
+    pub const SCHEMA: u8 = 0x03;
+    pub const CHANNEL: u8 = 0x04;
+    pub const MESSAGE: u8 = 0x05;
+    pub const CHUNK: u8 = 0x06;
+    pub const CHUNK_INDEX: u8 = 0x08;
+    pub const ATTACHMENT: u8 = 0x09;
+    pub const ATTACHMENT_INDEX: u8 = 0x0a;
+    pub const STATISTICS: u8 = 0x0b;
+    pub const METADATA: u8 = 0x0c;
+    pub const METADATA_INDEX: u8 = 0x0d;
+    pub const DATA_END: u8 = 0x0f;
 }
 
 /// Parses the opcode and body length of the record whose head is `bytes`.
-pub(super) fn head(bytes: &[u8]) -> Option<(u8, u64)> {
+pub fn head(bytes: &[u8]) -> Option<(u8, u64)> {
     let (opcode, rest) = bytes.split_first()?;
     Some((*opcode, u64::from_le_bytes(*rest.first_chunk()?)))
 }
 
-pub(super) struct Records<'a> {
+pub struct Records<'a> {
     bytes: &'a [u8],
     at: usize,
 }
 
 impl<'a> Records<'a> {
-    pub(super) fn new(bytes: &'a [u8]) -> Self {
+    pub fn new(bytes: &'a [u8]) -> Self {
         Self { bytes, at: 0 }
     }
 }
 
 #[derive(Copy, Clone)]
-pub(super) struct McapRecord<'a> {
-    pub(super) opcode: u8,
+pub struct McapRecord<'a> {
+    pub opcode: u8,
     /// Offset of the body in the buffer.
-    pub(super) at: usize,
-    pub(super) body: &'a [u8],
+    pub at: usize,
+    pub body: &'a [u8],
 }
 
 impl<'a> Iterator for Records<'a> {
@@ -75,16 +75,16 @@ impl<'a> Iterator for Records<'a> {
 }
 
 #[derive(Copy, Clone)]
-pub(super) struct MessageHead {
-    pub(super) channel: u16,
-    pub(super) sequence: u32,
-    pub(super) log_time: u64,
-    pub(super) publish_time: u64,
+pub struct MessageHead {
+    pub channel: u16,
+    pub sequence: u32,
+    pub log_time: u64,
+    pub publish_time: u64,
 }
 
 impl MessageHead {
     #[inline]
-    pub(super) fn parse(body: &[u8]) -> Option<Self> {
+    pub fn parse(body: &[u8]) -> Option<Self> {
         let mut fields = Fields(body);
         Some(Self {
             channel: fields.u16()?,
@@ -95,7 +95,7 @@ impl MessageHead {
     }
 
     #[cfg(feature = "bags")]
-    pub(super) fn to_bytes(self) -> [u8; MESSAGE_HEAD] {
+    pub fn to_bytes(self) -> [u8; MESSAGE_HEAD] {
         let mut bytes = [0; MESSAGE_HEAD];
         bytes[..2].copy_from_slice(&self.channel.to_le_bytes());
         bytes[2..6].copy_from_slice(&self.sequence.to_le_bytes());
@@ -105,17 +105,17 @@ impl MessageHead {
     }
 }
 
-pub(super) struct ChunkHead<'a> {
-    pub(super) uncompressed: u64,
-    pub(super) crc: u32,
-    pub(super) compression: &'a str,
-    pub(super) compressed: u64,
+pub struct ChunkHead<'a> {
+    pub uncompressed: u64,
+    pub crc: u32,
+    pub compression: &'a str,
+    pub compressed: u64,
     /// Bytes before the compressed data.
-    pub(super) len: usize,
+    pub len: usize,
 }
 
 impl<'a> ChunkHead<'a> {
-    pub(super) fn parse(body: &'a [u8]) -> Option<Self> {
+    pub fn parse(body: &'a [u8]) -> Option<Self> {
         let mut fields = Fields(body);
         // Start and end time: those of the messages are used.
         fields.u64()?;
@@ -127,15 +127,15 @@ impl<'a> ChunkHead<'a> {
     }
 }
 
-pub(super) struct McapSchema<'a> {
-    pub(super) id: u16,
-    pub(super) name: &'a str,
-    pub(super) encoding: &'a str,
-    pub(super) data: &'a [u8],
+pub struct McapSchema<'a> {
+    pub id: u16,
+    pub name: &'a str,
+    pub encoding: &'a str,
+    pub data: &'a [u8],
 }
 
 impl<'a> McapSchema<'a> {
-    pub(super) fn parse(body: &'a [u8]) -> Option<Self> {
+    pub fn parse(body: &'a [u8]) -> Option<Self> {
         let mut fields = Fields(body);
         Some(Self {
             id: fields.u16()?,
@@ -146,16 +146,16 @@ impl<'a> McapSchema<'a> {
     }
 }
 
-pub(super) struct McapChannel<'a> {
-    pub(super) id: u16,
-    pub(super) schema: u16,
-    pub(super) topic: &'a str,
-    pub(super) encoding: &'a str,
-    pub(super) metadata: Map<'a>,
+pub struct McapChannel<'a> {
+    pub id: u16,
+    pub schema: u16,
+    pub topic: &'a str,
+    pub encoding: &'a str,
+    pub metadata: Map<'a>,
 }
 
 impl<'a> McapChannel<'a> {
-    pub(super) fn parse(body: &'a [u8]) -> Option<Self> {
+    pub fn parse(body: &'a [u8]) -> Option<Self> {
         let mut fields = Fields(body);
         let (id, schema) = (fields.u16()?, fields.u16()?);
         let (topic, encoding) = (fields.text()?, fields.text()?);
@@ -167,46 +167,46 @@ impl<'a> McapChannel<'a> {
 
 /// A map of texts: its pairs are complete, but may not be UTF-8.
 #[derive(Copy, Clone)]
-pub(super) struct Map<'a>(Fields<'a>);
+pub struct Map<'a>(Fields<'a>);
 
 impl<'a> Map<'a> {
     /// Returns the value of the first pair with this key, if it is UTF-8.
-    pub(super) fn get(&self, key: &str) -> Option<&'a str> {
+    pub fn get(&self, key: &str) -> Option<&'a str> {
         let (_, value) = self.pairs().find(|(found, _)| *found == key.as_bytes())?;
         str::from_utf8(value).ok()
     }
 
     /// Returns key and value of each pair, in order.
-    pub(super) fn pairs(&self) -> impl Iterator<Item = (&'a [u8], &'a [u8])> + use<'a> {
+    pub fn pairs(&self) -> impl Iterator<Item = (&'a [u8], &'a [u8])> + use<'a> {
         let mut rest = self.0;
         std::iter::from_fn(move || Some((rest.bytes()?, rest.bytes()?)))
     }
 }
 
-pub(super) struct McapMetadata<'a> {
-    pub(super) name: &'a str,
-    pub(super) map: Map<'a>,
+pub struct McapMetadata<'a> {
+    pub name: &'a str,
+    pub map: Map<'a>,
 }
 
 impl<'a> McapMetadata<'a> {
-    pub(super) fn parse(body: &'a [u8]) -> Option<Self> {
+    pub fn parse(body: &'a [u8]) -> Option<Self> {
         let mut fields = Fields(body);
         Some(Self { name: fields.text()?, map: fields.map()? })
     }
 }
 
-pub(super) struct McapAttachment<'a> {
-    pub(super) name: &'a str,
-    pub(super) media_type: &'a str,
-    pub(super) data: &'a [u8],
+pub struct McapAttachment<'a> {
+    pub name: &'a str,
+    pub media_type: &'a str,
+    pub data: &'a [u8],
     /// Checksum of everything before it; 0 if the writer left it out.
-    pub(super) crc: u32,
+    pub crc: u32,
     /// Bytes before the checksum; the data are the last of them.
-    pub(super) len: usize,
+    pub len: usize,
 }
 
 impl<'a> McapAttachment<'a> {
-    pub(super) fn parse(body: &'a [u8]) -> Option<Self> {
+    pub fn parse(body: &'a [u8]) -> Option<Self> {
         let mut fields = Fields(body);
         let (_log_time, _create_time) = (fields.u64()?, fields.u64()?);
         let (name, media_type) = (fields.text()?, fields.text()?);
@@ -218,20 +218,20 @@ impl<'a> McapAttachment<'a> {
 }
 
 /// Position and content of a chunk, from the summary.
-pub(super) struct ChunkIndex {
-    pub(super) start_time: u64,
-    pub(super) end_time: u64,
-    pub(super) offset: u64,
+pub struct ChunkIndex {
+    pub start_time: u64,
+    pub end_time: u64,
+    pub offset: u64,
     /// Length of the chunk record, including its head.
-    pub(super) len: u64,
+    pub len: u64,
     /// Length of the message index records after it.
-    pub(super) index_len: u64,
+    pub index_len: u64,
     /// The channels with messages in it; empty if the writer left them out.
-    pub(super) channels: Vec<u16>,
+    pub channels: Vec<u16>,
 }
 
 impl ChunkIndex {
-    pub(super) fn parse(body: &[u8]) -> Option<Self> {
+    pub fn parse(body: &[u8]) -> Option<Self> {
         let mut fields = Fields(body);
         let (start_time, end_time) = (fields.u64()?, fields.u64()?);
         let (offset, len) = (fields.u64()?, fields.u64()?);
@@ -242,17 +242,17 @@ impl ChunkIndex {
     }
 }
 
-pub(super) struct Statistics {
-    pub(super) channels: u32,
-    pub(super) chunks: u32,
-    pub(super) attachments: u32,
-    pub(super) metadata: u32,
+pub struct Statistics {
+    pub channels: u32,
+    pub chunks: u32,
+    pub attachments: u32,
+    pub metadata: u32,
     /// Messages per channel.
-    pub(super) messages: Vec<(u16, u64)>,
+    pub messages: Vec<(u16, u64)>,
 }
 
 impl Statistics {
-    pub(super) fn parse(body: &[u8]) -> Option<Self> {
+    pub fn parse(body: &[u8]) -> Option<Self> {
         let mut fields = Fields(body);
         let (_messages, _schemas) = (fields.u64()?, fields.u16()?);
         let (channels, attachments) = (fields.u32()?, fields.u32()?);

@@ -11,21 +11,21 @@ use std::path::{Path, PathBuf};
 use rusqlite::types::ValueRef;
 use rusqlite::{Connection, ErrorCode, Row, Rows as Cursor};
 
-use super::chunk::OpenSegment;
-use super::damage::{Damage, DamageLocation};
-use super::error::ReplayError;
-use super::options::Span;
-use super::records::MessageHead;
+use crate::chunk::OpenSegment;
+use crate::damage::{Damage, DamageLocation};
+use crate::error::ReplayError;
+use crate::options::Span;
+use crate::records::MessageHead;
 
 /// Size in bytes at which a piece ends, after the message that reaches it.
 const PIECE_BYTES: usize = 1 << 20;
 
 /// Conditions: messages of the same time after a given one, and those after a time.
-pub(super) const SAME_TIME: &str = "timestamp = ?1 AND rowid > ?2";
-pub(super) const LATER: &str = "timestamp > ?1";
+pub const SAME_TIME: &str = "timestamp = ?1 AND rowid > ?2";
+pub const LATER: &str = "timestamp > ?1";
 
 /// Returns a query of messages in their order, with the content of those of the topics in `list`.
-pub(super) fn select(index: &str, list: &str, condition: &str) -> String {
+pub fn select(index: &str, list: &str, condition: &str) -> String {
     format!(
         "SELECT rowid, timestamp, topic_id, CASE WHEN topic_id IN ({list}) THEN data END \
          FROM messages INDEXED BY {index} WHERE {condition} ORDER BY timestamp, rowid"
@@ -35,7 +35,7 @@ pub(super) fn select(index: &str, list: &str, condition: &str) -> String {
 /// `SQLITE_IOERR_SHORT_READ`.
 const SHORT_READ: i32 = 522;
 
-pub(super) struct MessageRows {
+pub struct MessageRows {
     path: PathBuf,
     /// `None` once everything is read: an open database keeps pages in memory.
     db: Option<Connection>,
@@ -66,7 +66,7 @@ enum PieceEnd {
 }
 
 impl MessageRows {
-    pub(super) fn new(
+    pub fn new(
         path: &Path,
         db: Connection,
         index: String,
@@ -89,11 +89,11 @@ impl MessageRows {
         }
     }
 
-    pub(super) fn path(&self) -> &Path {
+    pub fn path(&self) -> &Path {
         &self.path
     }
 
-    pub(super) fn damaged(&self, what: Damage) -> ReplayError {
+    pub fn damaged(&self, what: Damage) -> ReplayError {
         let what = match what {
             Damage::Database(error) if is_of_system(&*error) => {
                 let source = std::io::Error::other(error);
@@ -106,7 +106,7 @@ impl MessageRows {
     }
 
     /// Begins with the first message of `span`. `known_damage` is the damage that is already known.
-    pub(super) fn start(
+    pub fn start(
         &mut self,
         span: Span,
         known_damage: Option<Damage>,
@@ -132,13 +132,13 @@ impl MessageRows {
         }
     }
 
-    pub(super) fn next_start(&self) -> Option<u64> {
+    pub fn next_start(&self) -> Option<u64> {
         self.next
     }
 
     /// Reads the next piece, and returns its number. An error is reported in a piece of its own, so
     /// that all earlier messages are delivered.
-    pub(super) fn open_next(&mut self, into: &mut OpenSegment) -> Result<u64, ReplayError> {
+    pub fn open_next(&mut self, into: &mut OpenSegment) -> Result<u64, ReplayError> {
         into.clear();
         self.pieces += 1;
         if let Some(what) = self.broken.take() {
@@ -192,7 +192,7 @@ impl MessageRows {
 }
 
 /// Returns whether the system failed, and not the database.
-pub(super) fn is_of_system(error: &(dyn Error + 'static)) -> bool {
+pub fn is_of_system(error: &(dyn Error + 'static)) -> bool {
     let Some(error) = error.downcast_ref::<rusqlite::Error>() else { return false };
     // A file that is too short is not a failure of the system.
     let is_short = error.sqlite_error().is_some_and(|error| error.extended_code == SHORT_READ);
@@ -205,7 +205,7 @@ pub(super) fn is_of_system(error: &(dyn Error + 'static)) -> bool {
     !is_short && error.sqlite_error_code().is_some_and(|code| codes.contains(&code))
 }
 
-fn unreadable(error: rusqlite::Error) -> Damage {
+pub fn unreadable(error: rusqlite::Error) -> Damage {
     Damage::Database(error.into())
 }
 
@@ -259,7 +259,7 @@ impl PieceFiller<'_> {
 }
 
 /// Returns the time of a message, in ns.
-pub(super) fn time(value: ValueRef<'_>) -> Result<i64, Damage> {
+pub fn time(value: ValueRef<'_>) -> Result<i64, Damage> {
     match value {
         ValueRef::Integer(at) if at >= 0 => Ok(at),
         ValueRef::Integer(_) => Err(Damage::Malformed("a message is from before 1970")),
@@ -285,13 +285,8 @@ mod tests {
             (ffi::SQLITE_NOTADB, true),
         ] {
             let db = Connection::open_in_memory().unwrap();
-            let rows = MessageRows::new(
-                Path::new("drive.db3"),
-                db,
-                String::new(),
-                HashMap::new(),
-                Ok(None),
-            );
+            let path = Path::new("drive.db3");
+            let rows = MessageRows::new(path, db, String::new(), HashMap::new(), Ok(None));
             let what = unreadable(rusqlite::Error::SqliteFailure(ffi::Error::new(code), None));
             match rows.damaged(what) {
                 ReplayError::Damaged { .. } => assert!(is_damage, "{code}"),

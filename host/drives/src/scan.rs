@@ -10,13 +10,13 @@ use std::collections::{BTreeSet, HashMap};
 
 use tracing::warn;
 
-use super::chunk::{FileSegment, OpenSegment, Opener, SegmentKind, message_head};
-use super::damage::Damage;
-use super::error::ReplayError;
-use super::file::Contents;
-use super::records::{ChunkIndex, HEAD, MAGIC, MESSAGE_HEAD, MessageHead, head, op};
-use super::source::SourceFile;
-use super::summary::read_tail;
+use crate::chunk::{OpenSegment, Opener, message_head};
+use crate::damage::Damage;
+use crate::error::ReplayError;
+use crate::file::{Contents, FileSegment, SegmentKind};
+use crate::records::{ChunkIndex, HEAD, MAGIC, MESSAGE_HEAD, MessageHead, head, op};
+use crate::source::SourceFile;
+use crate::summary::read_tail;
 
 /// Approximate size of the runs in which messages outside chunks are read, in bytes.
 const RUN: u64 = 1 << 20;
@@ -30,7 +30,7 @@ const MAX_RECORD: u64 = 16 << 20;
 
 /// Scans `source`. Damage is part of the result; an error is returned only if the file is not MCAP,
 /// or if the system cannot read it.
-pub(super) fn scan(source: &mut SourceFile, opener: &mut Opener) -> Result<Contents, ReplayError> {
+pub fn scan(source: &mut SourceFile, opener: &mut Opener) -> Result<Contents, ReplayError> {
     if source.peek(0, MAGIC.len())? != MAGIC {
         return Err(ReplayError::NotMcap { path: source.path().to_owned() });
     }

@@ -4,8 +4,8 @@
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
-use super::error::ReplayError;
-use super::track::Track;
+use crate::error::ReplayError;
+use crate::track::Track;
 
 /// Time in ns by which files of one recording may overlap: a recorder that goes on in another file
 /// may write some messages late.
@@ -25,7 +25,7 @@ const PAUSE_MAX: u64 = 5_000_000_000;
 ///
 /// [`ReplayError::Overlap`] if two recordings have the same topic at the same time: their samples
 /// would be mixed.
-pub(super) fn drives_of(
+pub fn drives_of(
     tracks: &[Track],
     recordings: &[PathBuf],
 ) -> Result<Vec<Vec<PathBuf>>, ReplayError> {

@@ -6,15 +6,17 @@ use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use super::damage::{Damage, DamageLocation};
-use super::error::ReplayError;
+use crate::damage::{Damage, DamageLocation};
+use crate::error::ReplayError;
+use crate::inflate::ZSTD;
+use crate::records::MAGIC;
 
 /// Bytes that [`SourceFile::peek`] reads at once. Record heads of small messages are close
 /// together.
 const WINDOW: usize = 64 * 1024;
 
 /// An open file of known length.
-pub(super) struct SourceFile {
+pub struct SourceFile {
     /// Read with explicit offsets: others may read it, too.
     file: Arc<File>,
     path: PathBuf,
@@ -24,7 +26,7 @@ pub(super) struct SourceFile {
 }
 
 impl SourceFile {
-    pub(super) fn open(path: &Path) -> Result<Self, ReplayError> {
+    pub fn open(path: &Path) -> Result<Self, ReplayError> {
         let cannot = |source| ReplayError::Open { path: path.to_owned(), source };
         // Checked before it is opened: opening a pipe would block for ever.
         let metadata = path.metadata().map_err(cannot)?;
@@ -41,7 +43,7 @@ impl SourceFile {
     }
 
     /// Opens the content of `file`, under the name `path`.
-    pub(super) fn over(file: Arc<File>, path: &Path) -> Result<Self, ReplayError> {
+    pub fn over(file: Arc<File>, path: &Path) -> Result<Self, ReplayError> {
         let path = path.to_owned();
         match file.metadata() {
             Ok(metadata) => {
@@ -53,29 +55,29 @@ impl SourceFile {
 
     /// Returns the file, whose own position is still at its start.
     #[cfg(feature = "bags")]
-    pub(super) fn into_file(self) -> Arc<File> {
+    pub fn into_file(self) -> Arc<File> {
         self.file
     }
 
-    pub(super) fn path(&self) -> &Path {
+    pub fn path(&self) -> &Path {
         &self.path
     }
 
-    pub(super) fn len(&self) -> u64 {
+    pub fn len(&self) -> u64 {
         self.len
     }
 
-    pub(super) fn damaged(&self, offset: u64, what: Damage) -> ReplayError {
+    pub fn damaged(&self, offset: u64, what: Damage) -> ReplayError {
         ReplayError::Damaged { path: self.path.clone(), at: DamageLocation::Byte(offset), what }
     }
 
     /// Fills `into` with the bytes from `offset` on, which the caller knows to be in the file.
-    pub(super) fn read(&mut self, offset: u64, into: &mut [u8]) -> Result<(), ReplayError> {
+    pub fn read(&mut self, offset: u64, into: &mut [u8]) -> Result<(), ReplayError> {
         self.file.read_exact_at(into, offset).map_err(|source| self.failed(offset, source))
     }
 
     /// Returns the `n` bytes at `offset` (at most [`WINDOW`]), or fewer at the end of the file.
-    pub(super) fn peek(&mut self, offset: u64, n: usize) -> Result<&[u8], ReplayError> {
+    pub fn peek(&mut self, offset: u64, n: usize) -> Result<&[u8], ReplayError> {
         let left = self.len.saturating_sub(offset);
         let n = n.min(usize::try_from(left).unwrap_or(usize::MAX)).min(WINDOW);
         let inside = offset
@@ -98,7 +100,7 @@ impl SourceFile {
     }
 
     /// Returns the CRC-32 of the first `end` bytes.
-    pub(super) fn checksum(&mut self, end: u64) -> Result<u32, ReplayError> {
+    pub fn checksum(&mut self, end: u64) -> Result<u32, ReplayError> {
         let mut hasher = crc32fast::Hasher::new();
         let mut piece = vec![0; WINDOW];
         let mut at = 0;
@@ -113,5 +115,29 @@ impl SourceFile {
 
     fn failed(&self, offset: u64, source: io::Error) -> ReplayError {
         ReplayError::Read { path: self.path.clone(), offset, source }
+    }
+}
+
+/// Format of a file, by its first bytes, as file names are not reliable.
+pub enum FileKind {
+    Mcap,
+    Database,
+    Packed,
+}
+
+/// Number of bytes that determine the format.
+pub const START: usize = 16;
+
+impl FileKind {
+    pub fn of(start: &[u8]) -> Option<Self> {
+        if start.starts_with(MAGIC) {
+            Some(Self::Mcap)
+        } else if start == b"SQLite format 3\0" {
+            Some(Self::Database)
+        } else if start.starts_with(&ZSTD) {
+            Some(Self::Packed)
+        } else {
+            None
+        }
     }
 }

@@ -1,6 +1,6 @@
 //! Results of replay steps, and the progress of a replay.
 
-use gleaner_transport::{Delivery, SampleMeta, Subscription};
+use gleaner_messages::transport::{Delivery, SampleMeta, Subscription};
 
 /// One delivery of a message.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]

@@ -1,71 +1,31 @@
-//! Finds the files of a drive, and the reader of each of them.
+//! Opens the files of a drive, each with the reader of its format.
 
 use std::collections::{BTreeMap, HashSet};
-use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 use tracing::warn;
 
-use super::chunk::Opener;
+use crate::bag::bag_of;
+use crate::chunk::Opener;
 #[cfg(feature = "bags")]
-use super::damage::Damage;
-use super::error::ReplayError;
-use super::file::Contents;
-use super::options::DriveOptions;
-use super::records::MAGIC;
-use super::scan::scan;
-use super::source::SourceFile;
-use super::track::{Store, Track};
+use crate::damage::Damage;
 #[cfg(feature = "bags")]
-use super::unpack::{Unpacked, unpack_one};
-use super::writers::Writers;
-
-#[derive(Default)]
-pub(super) struct Bag {
-    /// In the order of the metadata.
-    pub(super) files: Vec<PathBuf>,
-    /// Messages by topic, in all files; empty if unknown.
-    pub(super) messages: BTreeMap<String, u64>,
-    /// Set if metadata state that the files are one recording.
-    pub(super) is_one: bool,
-    /// A note for the user, in a sentence.
-    pub(super) remark: Option<String>,
-}
-
-/// Returns the files that these paths name: each file itself, and those of a rosbag2 directory.
-///
-/// # Errors
-///
-/// [`ReplayError`] if a directory is not one of rosbag2, or its metadata cannot be used.
-pub fn files_of(paths: &[PathBuf]) -> Result<Vec<PathBuf>, ReplayError> {
-    paths
-        .iter()
-        .map(|path| Ok(bag_of(path)?.files))
-        .collect::<Result<Vec<_>, _>>()
-        .map(|files| files.concat())
-}
-
-/// Returns the paths where SQLite keeps changes that are not yet in the database `path`;
-/// [`super::Replay`] checks whether they exist.
-pub fn journals_of(path: &Path) -> [PathBuf; 2] {
-    ["-wal", "-journal"]
-        .map(|suffix| OsString::from_iter([path.as_os_str(), suffix.as_ref()]).into())
-}
-
-/// Returns the files of a path: a file alone, or those of a directory.
-fn bag_of(path: &Path) -> Result<Bag, ReplayError> {
-    if !path.is_dir() {
-        return Ok(Bag { files: vec![path.to_owned()], ..Bag::default() });
-    }
-    #[cfg(feature = "bags")]
-    return super::bag::list(path);
-    #[cfg(not(feature = "bags"))]
-    Err(ReplayError::NotBuiltIn { path: path.to_owned(), what: "a rosbag2 directory" })
-}
+use crate::database::{self, DatabaseFile};
+use crate::error::ReplayError;
+use crate::file::Contents;
+use crate::options::DriveOptions;
+use crate::scan::scan;
+use crate::source::{FileKind, START, SourceFile};
+use crate::track::{Store, Track};
+#[cfg(feature = "bags")]
+use crate::unpack::unpack_one;
+#[cfg(feature = "bags")]
+use crate::unpacked::Unpacked;
+use crate::writers::Writers;
 
 /// Opens all files of `paths`. Returns them, and the path of each recording: a file, or a directory
 /// whose metadata state that its files are one.
-pub(super) fn open(
+pub fn open(
     paths: &[PathBuf],
     options: &DriveOptions,
     opener: &mut Opener,
@@ -121,30 +81,6 @@ fn count(files: &mut [(Store, Contents)], messages: &BTreeMap<String, u64>) {
     }
 }
 
-/// Format of a file, by its first bytes, as file names are not reliable.
-pub(super) enum FileKind {
-    Mcap,
-    Database,
-    Packed,
-}
-
-/// Number of bytes that determine the format.
-pub(super) const START: usize = 16;
-
-impl FileKind {
-    pub(super) fn of(start: &[u8]) -> Option<Self> {
-        if start.starts_with(MAGIC) {
-            Some(Self::Mcap)
-        } else if start == b"SQLite format 3\0" {
-            Some(Self::Database)
-        } else if start.starts_with(&super::inflate::ZSTD) {
-            Some(Self::Packed)
-        } else {
-            None
-        }
-    }
-}
-
 fn kind_of(source: &mut SourceFile) -> Result<FileKind, ReplayError> {
     if source.len() == 0 {
         return Err(ReplayError::Empty { path: source.path().to_owned() });
@@ -168,7 +104,7 @@ fn open_file(
         FileKind::Mcap => mcap(source, opener),
         #[cfg(feature = "bags")]
         FileKind::Database => {
-            database(super::database::DatabaseFile::beside_its_journal(path), source.len(), options)
+            database(DatabaseFile::beside_its_journal(path), source.len(), options)
         }
         #[cfg(feature = "bags")]
         FileKind::Packed => content(&unpack_one(source, options, room)?, options, opener),
@@ -189,11 +125,11 @@ fn mcap(mut source: SourceFile, opener: &mut Opener) -> Result<(Store, Contents)
 
 #[cfg(feature = "bags")]
 fn database(
-    file: super::database::DatabaseFile<'_>,
+    file: DatabaseFile<'_>,
     len: u64,
     options: &DriveOptions,
 ) -> Result<(Store, Contents), ReplayError> {
-    let (rows, contents) = super::database::open(file, len, options.limits)?;
+    let (rows, contents) = database::open(file, len, options.limits)?;
     Ok((Store::Rows(Box::new(rows)), contents))
 }
 
@@ -208,11 +144,10 @@ fn content(
     let len = source.len();
     let (store, mut contents) = match kind_of(&mut source)? {
         FileKind::Mcap => mcap(source, opener)?,
-        FileKind::Database => database(
-            super::database::DatabaseFile::elsewhere(path, unpacked.name(options)?.as_ref()),
-            len,
-            options,
-        )?,
+        FileKind::Database => {
+            let name = unpacked.name(options)?;
+            database(DatabaseFile::elsewhere(path, name.as_ref()), len, options)?
+        }
         FileKind::Packed => return Err(ReplayError::NotMcap { path: path.clone() }),
     };
     if let Some(error) = &unpacked.broken {

@@ -2,34 +2,34 @@
 
 use std::collections::HashMap;
 
-use super::damage::Damage;
-use super::error::ReplayError;
-use super::file::Channels;
-use super::records::{ChunkIndex, FOOTER, HEAD, MAGIC, Records, Statistics, head, op};
-use super::source::SourceFile;
+use crate::damage::Damage;
+use crate::error::ReplayError;
+use crate::file::Channels;
+use crate::records::{ChunkIndex, FOOTER, HEAD, MAGIC, Records, Statistics, head, op};
+use crate::source::SourceFile;
 
 /// Size limit of a summary: an index of two million chunks. A file with a larger one is read
 /// without it.
 const MAX_SUMMARY: u64 = 256 << 20;
 
-pub(super) struct Summary {
-    pub(super) channels: Channels,
+pub struct Summary {
+    pub channels: Channels,
     /// By their offset in the file.
-    pub(super) chunks: HashMap<u64, ChunkIndex>,
+    pub chunks: HashMap<u64, ChunkIndex>,
     /// Messages per channel.
-    pub(super) messages: HashMap<u16, u64>,
+    pub messages: HashMap<u16, u64>,
 }
 
 #[derive(Default)]
-pub(super) struct Tail {
+pub struct Tail {
     /// Set if footer and closing magic are present: the file was finished.
-    pub(super) finished: bool,
+    pub finished: bool,
     /// A summary that names every channel and every chunk, if the writer added one.
-    pub(super) summary: Option<Summary>,
-    pub(super) damage: Option<(u64, Damage)>,
+    pub summary: Option<Summary>,
+    pub damage: Option<(u64, Damage)>,
 }
 
-pub(super) fn read_tail(source: &mut SourceFile) -> Result<Tail, ReplayError> {
+pub fn read_tail(source: &mut SourceFile) -> Result<Tail, ReplayError> {
     let Some(Footer { at: footer_at, start, crc }) = footer(source)? else {
         return Ok(Tail::default());
     };
@@ -62,15 +62,15 @@ pub(super) fn read_tail(source: &mut SourceFile) -> Result<Tail, ReplayError> {
 }
 
 /// The last record of a finished file.
-pub(super) struct Footer {
-    pub(super) at: u64,
+pub struct Footer {
+    pub at: u64,
     /// Start of the summary; 0 if there is none.
     start: u64,
     crc: u32,
 }
 
 /// Returns the footer of `source`; `None` if the file is truncated or was never finished.
-pub(super) fn footer(source: &mut SourceFile) -> Result<Option<Footer>, ReplayError> {
+pub fn footer(source: &mut SourceFile) -> Result<Option<Footer>, ReplayError> {
     let Some(at) = source.len().checked_sub(FOOTER) else {
         return Ok(None);
     };

@@ -2,25 +2,25 @@
 
 use std::path::Path;
 
-use super::catalog::DriveChannel;
-use super::chunk::{FileSegment, OpenSegment, Opener, message_head};
-use super::damage::Damage;
-use super::error::ReplayError;
-use super::file::Contents;
-use super::inflate::{Inflate, ZSTD};
-use super::options::Span;
-use super::records::MESSAGE_HEAD;
+use crate::catalog::DriveChannel;
+use crate::chunk::{OpenSegment, Opener, message_head};
+use crate::damage::Damage;
+use crate::error::ReplayError;
+use crate::file::{Contents, FileSegment};
+use crate::inflate::{Inflate, ZSTD};
+use crate::options::Span;
+use crate::records::MESSAGE_HEAD;
 #[cfg(feature = "bags")]
-use super::rows::MessageRows;
-use super::source::SourceFile;
-use super::writers::{ChannelWriter, Writers};
+use crate::rows::MessageRows;
+use crate::source::SourceFile;
+use crate::writers::{ChannelWriter, Writers};
 use gleaner_messages::Endian;
-use gleaner_transport::{Guid, SampleMeta, Subscription};
+use gleaner_messages::transport::{Guid, SampleMeta, Subscription};
 
 /// Bytes before the CDR of a message.
 const ENCAPSULATION: usize = 4;
 
-pub(super) enum Store {
+pub enum Store {
     /// Segments, found when the file was opened.
     Mcap(SourceFile),
     /// A database, which makes segments on demand.
@@ -29,7 +29,7 @@ pub(super) enum Store {
 }
 
 impl Store {
-    pub(super) fn path(&self) -> &Path {
+    pub fn path(&self) -> &Path {
         match self {
             Self::Mcap(source) => source.path(),
             #[cfg(feature = "bags")]
@@ -46,7 +46,7 @@ impl Store {
     }
 }
 
-pub(super) struct Track {
+pub struct Track {
     store: Store,
     contents: Contents,
     times: Option<(u64, u64)>,
@@ -79,26 +79,21 @@ struct ChannelSubscription {
     max_bytes: usize,
 }
 
-pub(super) struct Routed<'a> {
-    pub(super) subscription: Subscription,
+pub struct Routed<'a> {
+    pub subscription: Subscription,
     /// Set if this is the last subscription of the message.
-    pub(super) is_last: bool,
-    pub(super) meta: SampleMeta,
+    pub is_last: bool,
+    pub meta: SampleMeta,
     /// Set if the message is packed and larger than the subscription takes. Then `cdr` may be only
     /// its beginning.
-    pub(super) is_too_big: bool,
+    pub is_too_big: bool,
     /// Set if the message is not plain CDR. Then `cdr` is all of it.
-    pub(super) is_malformed: bool,
-    pub(super) cdr: &'a [u8],
+    pub is_malformed: bool,
+    pub cdr: &'a [u8],
 }
 
 impl Track {
-    pub(super) fn new(
-        store: Store,
-        contents: Contents,
-        writers: &mut Writers,
-        recording: usize,
-    ) -> Self {
+    pub fn new(store: Store, contents: Contents, writers: &mut Writers, recording: usize) -> Self {
         let mut routes = Vec::new();
         for (id, writer) in writers.of_next_file(store.path(), &contents.channels) {
             // Ids are sorted, and 16 bits wide.
@@ -119,57 +114,57 @@ impl Track {
     }
 
     /// Returns whether opening it found damage.
-    pub(super) fn is_damaged(&self) -> bool {
+    pub fn is_damaged(&self) -> bool {
         self.contents.damage.is_some()
     }
 
-    pub(super) fn recording(&self) -> usize {
+    pub fn recording(&self) -> usize {
         self.recording
     }
 
-    pub(super) fn topics(&self) -> impl Iterator<Item = &str> {
+    pub fn topics(&self) -> impl Iterator<Item = &str> {
         let Contents { channels, messages, uncounted, .. } = &self.contents;
         let has_some = |id| *uncounted || messages.get(&id).is_some_and(|count| *count > 0);
         let all = channels.iter().filter(move |(id, _)| has_some(*id));
         all.map(|(_, info)| info.topic.as_str())
     }
 
-    pub(super) fn path_and_contents(&self) -> (&Path, &Contents) {
+    pub fn path_and_contents(&self) -> (&Path, &Contents) {
         (self.store.path(), &self.contents)
     }
 
     /// Returns the first and last log time of any message.
-    pub(super) fn times(&self) -> Option<(u64, u64)> {
+    pub fn times(&self) -> Option<(u64, u64)> {
         self.times
     }
 
     /// Returns whether the last of [`Track::times`] is lost, or no time of this age.
-    pub(super) fn is_end_unknown(&self) -> bool {
+    pub fn is_end_unknown(&self) -> bool {
         let is_late = self.times.is_some_and(|(_, last)| i64::try_from(last).is_err());
         self.contents.is_end_unknown || is_late
     }
 
     /// Continues the numbers of a writer after `seq`, for the channels of a subscription.
-    pub(super) fn skip_to(&mut self, subscription: Subscription, guid: Guid, seq: u64) {
+    pub fn skip_to(&mut self, subscription: Subscription, guid: Guid, seq: u64) {
         let is_it = |route: &&Route| route.subscriptions.iter().any(|one| one.by == subscription);
         let writers = self.routes.iter().filter(is_it).filter_map(|route| route.writer.as_ref());
         writers.filter(|writer| writer.guid() == guid).for_each(|writer| writer.skip_to(seq));
     }
 
     /// Counts a message of `channel` that was left out, and returns its topic.
-    pub(super) fn leave_out(&mut self, channel: u16) -> String {
+    pub fn leave_out(&mut self, channel: u16) -> String {
         if let Some(route) = self.routes.get_mut(usize::from(channel)) {
             route.seen += 1;
         }
         topic_of(&self.contents, channel)
     }
 
-    pub(super) fn damaged(&self, offset: u64, what: Damage) -> ReplayError {
+    pub fn damaged(&self, offset: u64, what: Damage) -> ReplayError {
         self.store.damaged(offset, what)
     }
 
     /// Subscribes a channel. `max_bytes` is the largest message to deliver, in bytes of CDR.
-    pub(super) fn subscribe(
+    pub fn subscribe(
         &mut self,
         channel: DriveChannel,
         subscription: Subscription,
@@ -185,7 +180,7 @@ impl Track {
 
     /// Queues the segments with subscribed messages of `span`. Returns the damage that the scan
     /// found, if any, and the log time before which everything is still delivered.
-    pub(super) fn start(&mut self, span: Span) -> Option<(u64, ReplayError)> {
+    pub fn start(&mut self, span: Span) -> Option<(u64, ReplayError)> {
         self.span = span;
         #[cfg(feature = "bags")]
         if let Store::Rows(rows) = &mut self.store {
@@ -213,7 +208,7 @@ impl Track {
     }
 
     /// Returns the log time at which the next segment must be open.
-    pub(super) fn next_start(&self) -> Option<u64> {
+    pub fn next_start(&self) -> Option<u64> {
         match &self.store {
             Store::Mcap(_) => self.queue.last().map(|segment| segment.start_time),
             #[cfg(feature = "bags")]
@@ -223,7 +218,7 @@ impl Track {
 
     /// Opens the next segment and returns its position, or in a database, its number. After an
     /// error there are no more.
-    pub(super) fn open_next(
+    pub fn open_next(
         &mut self,
         opener: &mut Opener,
         into: &mut OpenSegment,
@@ -257,7 +252,7 @@ impl Track {
     /// Parses the message record in `body`; `delivered` is the number of subscriptions that already
     /// received it. Packed messages are unpacked into `inflate`, and stay there until the next.
     #[inline]
-    pub(super) fn route<'a>(
+    pub fn route<'a>(
         &mut self,
         body: &'a [u8],
         delivered: usize,
@@ -275,27 +270,16 @@ impl Track {
         let is_packed = message.starts_with(&ZSTD);
         if is_packed {
             if delivered == 0 {
-                let topic = || topic_of(&self.contents, head.channel);
-                let unpacked =
-                    inflate.unpack(message, channel.max_bytes.saturating_add(ENCAPSULATION + 1));
-                unpacked.map_err(|source| Damage::Unpack { topic: topic(), source })?;
-                if inflate.is_full() {
-                    return Err(Damage::MessageTooLarge {
-                        topic: topic(),
-                        allowed: inflate.allowed(),
-                    });
-                }
+                unpack(message, channel.max_bytes, inflate, || {
+                    topic_of(&self.contents, head.channel)
+                })?;
             }
             message = inflate.bytes();
         }
-        let mut is_malformed = false;
-        let (endian, options, cdr) = match message {
-            &[0, 0, a, b, ref cdr @ ..] => (Endian::Big, [a, b], cdr),
-            &[0, 1, a, b, ref cdr @ ..] => (Endian::Little, [a, b], cdr),
-            other => {
-                is_malformed = true;
-                (Endian::Little, [0; 2], other)
-            }
+        let (is_malformed, endian, options, cdr) = match message {
+            &[0, 0, a, b, ref cdr @ ..] => (false, Endian::Big, [a, b], cdr),
+            &[0, 1, a, b, ref cdr @ ..] => (false, Endian::Little, [a, b], cdr),
+            other => (true, Endian::Little, [0; 2], other),
         };
         if delivered == 0 {
             writer.count(head.sequence);
@@ -323,7 +307,7 @@ impl Track {
 
     /// Returns, at the end, the first subscribed channel whose number of messages differs from the
     /// summary.
-    pub(super) fn missing(&self) -> Option<ReplayError> {
+    pub fn missing(&self) -> Option<ReplayError> {
         if !self.contents.claimed {
             return None;
         }
@@ -348,12 +332,27 @@ impl Track {
                         topic,
                         expected,
                         found,
-                        "metadata.yaml has another message count"
+                        "metadata.yaml and the database differ in the number of messages"
                     );
                     None
                 }
             }
         })
+    }
+}
+
+/// Unpacks a message into `inflate`, up to the largest one that a subscription takes.
+fn unpack(
+    message: &[u8],
+    max_bytes: usize,
+    inflate: &mut Inflate,
+    topic: impl Fn() -> String,
+) -> Result<(), Damage> {
+    let unpacked = inflate.unpack(message, max_bytes.saturating_add(ENCAPSULATION + 1));
+    unpacked.map_err(|source| Damage::Unpack { topic: topic(), source })?;
+    match inflate.is_full() {
+        true => Err(Damage::MessageTooLarge { topic: topic(), allowed: inflate.allowed() }),
+        false => Ok(()),
     }
 }
 
@@ -363,7 +362,7 @@ fn topic_of(contents: &Contents, channel: u16) -> String {
 
 /// Converts a time of a file, where times are unsigned. Log times of messages fit; index times and
 /// publish times may be beyond the year 2262, and saturate.
-pub(super) fn nanoseconds(log_time: u64) -> i64 {
+pub fn nanoseconds(log_time: u64) -> i64 {
     i64::try_from(log_time).unwrap_or(i64::MAX)
 }
 

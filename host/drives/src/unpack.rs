@@ -15,14 +15,15 @@ use std::time::Duration;
 use rustix::fs::{AtFlags, CWD, Mode, OFlags, fstatvfs, linkat, open};
 use rustix::io::Errno;
 use rustix::process::geteuid;
-use tempfile::{Builder, TempPath};
+use tempfile::Builder;
 use tracing::warn;
 use zstd::stream::read::Decoder;
 
-use super::error::ReplayError;
-use super::options::DriveOptions;
-use super::source::SourceFile;
-use super::storage::{FileKind, START, files_of};
+use crate::bag::files_of;
+use crate::error::ReplayError;
+use crate::options::DriveOptions;
+use crate::source::{FileKind, START, SourceFile};
+use crate::unpacked::{ContentName, Unpacked};
 
 /// Size of a write, in bytes.
 const PIECE: usize = 1 << 20;
@@ -35,33 +36,6 @@ const SHARE: u64 = 64;
 const PREFIX: &str = ".unpacked-";
 /// Age since the last write from which a file of such a name belongs to a killed process.
 const STALE: Duration = Duration::from_secs(3600);
-
-#[derive(Clone, Debug)]
-pub struct Unpacked {
-    /// The packed file, named as in the drive.
-    pub(super) path: PathBuf,
-    pub(super) content: Arc<File>,
-    /// The reason why the content is incomplete, if it is.
-    pub(super) broken: Option<String>,
-    name: Option<ContentName>,
-}
-
-#[derive(Clone, Debug)]
-pub enum ContentName {
-    /// Removed with the last clone.
-    Own(Arc<TempPath>),
-    /// Created and removed by the process that unpacked the file.
-    Given(PathBuf),
-}
-
-impl AsRef<Path> for ContentName {
-    fn as_ref(&self) -> &Path {
-        match self {
-            Self::Own(name) => name,
-            Self::Given(name) => name,
-        }
-    }
-}
 
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 enum SizeLimit {
@@ -104,7 +78,7 @@ impl SizeLimit {
 ///
 /// # Errors
 ///
-/// As [`Replay::open`](super::Replay::open), for these files.
+/// As [`Replay::open`](crate::Replay::open), for these files.
 pub fn unpack(paths: &[PathBuf], options: &DriveOptions) -> Result<Vec<Unpacked>, ReplayError> {
     let mut room = options.limits.unpacked_bytes;
     let mut unpacked = Vec::new();
@@ -170,34 +144,6 @@ pub(super) fn unpack_one(
 }
 
 impl Unpacked {
-    /// Opens the content of the packed file `path`, which another process unpacked by [`unpack`]
-    /// and named `name` temporarily; `broken` is the reason if it is incomplete.
-    ///
-    /// # Errors
-    ///
-    /// Errors of opening `name`.
-    pub fn named(path: PathBuf, name: PathBuf, broken: Option<String>) -> io::Result<Self> {
-        Ok(Self {
-            path,
-            content: Arc::new(File::open(&name)?),
-            broken,
-            name: Some(ContentName::Given(name)),
-        })
-    }
-
-    /// Returns the name that another process gave the content, if one did.
-    pub fn given_name(&self) -> Option<&Path> {
-        match &self.name {
-            Some(ContentName::Given(name)) => Some(name),
-            _ => None,
-        }
-    }
-
-    /// Returns the packed file, and the reason if its content is incomplete.
-    pub fn parts(&self) -> (&Path, Option<&str>) {
-        (&self.path, self.broken.as_deref())
-    }
-
     /// Names the content for as long as the result lives: SQLite opens files by name only, and the
     /// links in `/proc` lead to names that do not exist.
     ///

@@ -8,14 +8,14 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 
 use tracing::warn;
 
-use super::file::Channels;
-use gleaner_transport::Guid;
+use crate::file::Channels;
+use gleaner_messages::transport::Guid;
 
 /// The first bytes of the identity of a writer that no file names.
 const MADE_UP: &[u8] = b"mcap";
 
 #[derive(Default)]
-pub(super) struct Writers {
+pub struct Writers {
     files: u32,
     /// Sequence numbers, by topic and writer. Two clips of one drive name the same writer, whose
     /// numbers must continue from one to the other.
@@ -31,7 +31,7 @@ struct Numbers {
     is_split: AtomicBool,
 }
 
-pub(super) struct ChannelWriter {
+pub struct ChannelWriter {
     guid: Guid,
     /// True if the channel's metadata names it, and it was a real one.
     is_named: bool,
@@ -39,20 +39,20 @@ pub(super) struct ChannelWriter {
 }
 
 impl ChannelWriter {
-    pub(super) fn guid(&self) -> Guid {
+    pub fn guid(&self) -> Guid {
         self.guid
     }
 
-    pub(super) fn last_seq(&self) -> u64 {
+    pub fn last_seq(&self) -> u64 {
         self.numbers.last.load(Relaxed)
     }
 
     /// Continues after the number `seq`.
-    pub(super) fn skip_to(&self, seq: u64) {
+    pub fn skip_to(&self, seq: u64) {
         self.numbers.last.fetch_max(seq, Relaxed);
     }
 
-    pub(super) fn count(&self, sequence: u32) {
+    pub fn count(&self, sequence: u32) {
         let last = self.last_seq();
         // A named writer counts all its life; it has sent a sample twice if its number comes again.
         // Other recorders may write 0, and numbers that fall back after a restart of the writer or
@@ -74,11 +74,7 @@ impl Writers {
     /// A channel has the writer that its metadata claims, unless another channel of its topic in
     /// this file claimed it first: then sequence numbers would be ambiguous. Channels without a
     /// claim get an identity made of the file's position in the drive and the channel's id.
-    pub(super) fn of_next_file(
-        &mut self,
-        path: &Path,
-        channels: &Channels,
-    ) -> Vec<(u16, ChannelWriter)> {
+    pub fn of_next_file(&mut self, path: &Path, channels: &Channels) -> Vec<(u16, ChannelWriter)> {
         let mut taken = HashSet::new();
         let mut ignored = 0_u32;
         // Claims come first, so that no generated identity equals a later claim.

@@ -10,7 +10,7 @@ use gleaner_protocol::inference::{
     ModelRequest, ModelResult, TensorPlace,
 };
 use gleaner_protocol::link::Incoming;
-use gleaner_vitals::{monotonic_ns, usage};
+use gleaner_protocol::process_stats::{monotonic_ns, usage};
 use tracing::{error, info};
 
 use crate::client::{CallStage, ConnectedLambda, LambdaId, OpenCall};
@@ -89,10 +89,7 @@ impl InferenceEngine {
     }
 
     /// Serves lambdas until the starter sends stop or ends, or until `stop` is readable.
-    ///
-    /// # Errors
-    ///
-    /// [`EngineError`]: the starter starts the process again.
+    /// After an error, the starter starts the process again.
     pub(crate) fn run(
         mut self,
         mut control: InferenceServer,
@@ -100,7 +97,7 @@ impl InferenceEngine {
     ) -> Result<(), EngineError> {
         (self.reports)(InferenceReport::Ready);
         let end = self.serve(&mut control, stop)?;
-        info!(reason = ?end, "gleaner-inference ends");
+        info!(reason = ?end, "gleaner-inference is shutting down");
         self.schedule.stop(None);
         self.threads.wait_idle(END_TIMEOUT);
         let status = self.current_status();
@@ -192,7 +189,7 @@ impl InferenceEngine {
                 Ok(Incoming::Ended) => return Some(EngineEnd::StarterEnded),
                 Err(why) => {
                     let error = &why as &dyn std::error::Error;
-                    error!(error, "the connection to the starter failed");
+                    error!(error, "the connection to the parent process failed");
                     return Some(EngineEnd::StarterEnded);
                 }
             }

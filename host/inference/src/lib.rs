@@ -13,29 +13,42 @@
 //! - [`backend`]: the libraries that run models.
 //! - [`program`]: the program `gleaner-inference`.
 //!
-//! A lambda is a stranger, and so is the author of a model: no byte of either is trusted. A lambda
-//! that breaks the protocol loses its connection; a model that takes too much memory or time ends
-//! the process, which its starter starts again.
+//! A lambda is an untrusted peer, and so is the author of a model: no byte of either is trusted. A
+//! lambda that breaks the protocol loses its connection; a model that takes too much memory or time
+//! ends the process, which its starter starts again.
 
+#[cfg(feature = "program")]
 pub mod backend;
+#[cfg(feature = "program")]
 mod client;
+#[cfg(feature = "program")]
 mod engine;
+#[cfg(feature = "program")]
 mod engine_error;
 pub mod inspect;
+#[cfg(feature = "program")]
 mod lambdas;
+#[cfg(feature = "program")]
 mod loader;
+#[cfg(feature = "program")]
 mod loads;
+#[cfg(feature = "program")]
 mod memory;
-#[cfg(test)]
-#[path = "../tests/suite/onnx.rs"]
-mod onnx;
+#[cfg(feature = "program")]
 mod pace;
 pub mod places;
+#[cfg(feature = "program")]
 pub mod program;
 pub mod queue;
+#[cfg(feature = "program")]
 mod region;
+#[cfg(feature = "program")]
 mod running;
+#[cfg(feature = "program")]
 mod schedule;
+#[cfg(feature = "program")]
 mod sessions;
+#[cfg(feature = "program")]
 mod threads;
+#[cfg(feature = "program")]
 mod worker;

@@ -85,7 +85,7 @@ pub(crate) struct ModelLoader {
 enum ModelError {
     #[error("it cannot be read")]
     Read(#[source] io::Error),
-    #[error("it is no regular file")]
+    #[error("it is not a regular file")]
     NoFile,
     #[error("it has {bytes} bytes; {max} are allowed")]
     TooLarge { bytes: u64, max: u64 },

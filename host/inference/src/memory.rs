@@ -6,7 +6,7 @@ use std::sync::OnceLock;
 
 use gleaner_protocol::Layer;
 use gleaner_protocol::inference::ModelMemory;
-use gleaner_vitals::usage;
+use gleaner_protocol::process_stats::usage;
 use rustix::process::{Resource, getrlimit};
 
 /// The divisor of the part of the limit that is left to each run.
@@ -20,7 +20,7 @@ static LIBRARIES: OnceLock<u64> = OnceLock::new();
 /// Limits the memory that this process takes from now on.
 pub(crate) fn limit(bytes: u64) -> Layer {
     LIMIT.get_or_init(|| bytes);
-    gleaner_jail::memory::limit(bytes)
+    gleaner_sandbox::memory::limit(bytes)
 }
 
 /// Returns private writable memory, in bytes; 0 if unknown.

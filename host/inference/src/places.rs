@@ -30,7 +30,9 @@ pub enum PlaceError {
     Size { name: String },
     #[error("the inputs have {bytes} bytes; {MAX_TENSOR_BYTES} are allowed")]
     TooLarge { bytes: u64 },
-    #[error("input `{name}` begins at offset {offset}, which is no multiple of {TENSOR_ALIGNMENT}")]
+    #[error(
+        "input `{name}` begins at offset {offset}, which is not a multiple of {TENSOR_ALIGNMENT}"
+    )]
     Unaligned { name: String, offset: u64 },
     #[error(
         "input `{name}` has {bytes} bytes at offset {offset}, beyond the {region} bytes of the \
@@ -41,10 +43,6 @@ pub enum PlaceError {
 
 /// Checks the inputs of a run against those that the model needs, and against the region of
 /// `region_bytes`. Returns them in the order of the model.
-///
-/// # Errors
-///
-/// [`PlaceError`] names the first input that does not fit.
 pub fn check_inputs(
     needed: &[TensorInfo],
     given: &[TensorPlace],
@@ -102,10 +100,6 @@ fn check_input(
 pub struct OutputsTooLarge;
 
 /// Places outputs one after another. Returns their places, and the size of the region.
-///
-/// # Errors
-///
-/// [`OutputsTooLarge`].
 pub fn place_outputs<'a>(
     outputs: impl Iterator<Item = (&'a str, Element, &'a [u32])>,
 ) -> Result<(Vec<TensorPlace>, u64), OutputsTooLarge> {
@@ -179,7 +173,7 @@ mod tests {
         for shape in [&[2, 0][..], &[2, u32::MAX], &[u32::MAX; 8], &[1; 9], &[1; 4000]] {
             assert_eq!(a(shape, 0), size);
         }
-        assert!(a(&[2, 1], 4).contains("no multiple of 64"));
+        assert!(a(&[2, 1], 4).contains("not a multiple of 64"));
         for offset in [1024, 1024 - 64, u64::MAX - 63, 1 << 63] {
             assert!(a(&[2, 9], offset).contains("beyond the 1024 bytes"), "{offset}");
         }

@@ -58,7 +58,6 @@ impl<O: Copy + Eq + Hash, T> FairQueue<O, T> {
         Some((owner, self.remove(owner)?))
     }
 
-    /// Returns the waiting entries.
     pub fn entries(&self) -> impl Iterator<Item = &T> {
         self.waiting.iter().map(|waiting| &waiting.entry)
     }

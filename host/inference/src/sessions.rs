@@ -54,7 +54,7 @@ pub(crate) struct ModelSession {
     pub(crate) path: String,
     pub(crate) state: LoadState,
     pub(crate) counts: RunCounts,
-    /// Begin of the time without lambdas.
+    /// Time at which the last lambda disconnected.
     unused_since: Option<Instant>,
 }
 

@@ -4,13 +4,15 @@ use std::os::fd::{AsFd, OwnedFd};
 use std::time::{Duration, Instant};
 
 use gleaner_buffers::shared::SharedLayout;
+use gleaner_messages::transport::{
+    DefinitionsSearch, DiscoveredTopic, Health, LiveSource, same_type,
+};
 use gleaner_protocol::ingress::{
     AddReader, AddTopics, AttachedTopic, IngressReport, IngressRequest, IngressServer,
     IngressStatus, ReaderMessage, RefusedTopic, RegionLayout, SourceStatus, TopicGrant,
 };
 use gleaner_protocol::link::{Incoming, LinkError};
-use gleaner_transport::{DefinitionsSearch, DiscoveredTopic, Health, LiveSource, same_type};
-use gleaner_vitals::usage;
+use gleaner_protocol::process_stats::usage;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 use tracing::{error, info, warn};
@@ -84,7 +86,7 @@ impl Ingress {
         (self.reports)(IngressReport::Ready);
         let mut control = control;
         let end = self.serve(&mut control, stop.as_ref())?;
-        info!(reason = ?end, "the ingress ends");
+        info!(reason = ?end, "ingress is shutting down");
         self.update_status(Instant::now());
         let status = self.status();
         (self.reports)(IngressReport::Ended(Box::new(status)));
@@ -185,7 +187,7 @@ impl Ingress {
                 Ok(Incoming::Ended) => return Some(LoopEnd::StarterEnded),
                 Err(why @ (LinkError::Grant { .. } | LinkError::NoSocket { .. })) => {
                     let error = &why as &dyn std::error::Error;
-                    error!(error, "a request of the starter is refused");
+                    error!(error, "refused request from parent process");
                 }
                 Err(why) => {
                     let error = &why as &dyn std::error::Error;
@@ -198,11 +200,14 @@ impl Ingress {
 
     fn add_reader(&mut self, add: &AddReader, socket: OwnedFd) {
         if self.readers.len() == READERS {
-            error!(reader = add.name, most = READERS, "too many readers: one is refused");
+            error!(reader = add.name, most = READERS, "refused a reader: too many are connected");
             return;
         }
         if self.readers.iter().any(|reader| reader.name == add.name) {
-            warn!(reader = add.name, "a second reader of this name");
+            warn!(
+                reader = add.name,
+                "a reader of this name is connected already; the old one ends"
+            );
         }
         match ConnectedReader::welcome(add, socket, &*self.source, Instant::now()) {
             Ok(reader) => self.readers.push(reader),
@@ -219,7 +224,7 @@ impl Ingress {
     fn add_topics(&mut self, add: AddTopics) {
         match self.readers.iter().rposition(|reader| reader.name == add.reader) {
             Some(index) => self.grant(index, &add.topics),
-            None => warn!(reader = add.reader, "further topics for a reader that has ended"),
+            None => warn!(reader = add.reader, "ignored topics for a reader that has ended"),
         }
         self.remove_gone();
     }
@@ -337,7 +342,7 @@ impl Ingress {
             for attachment in &reader.topics {
                 self.topics.detach(&mut *self.source, attachment.topic, &attachment.attached);
             }
-            info!(reader = reader.name, "a reader has ended");
+            info!(reader = reader.name, "a reader has disconnected");
         }
     }
 

@@ -8,8 +8,8 @@
 //! - `sink`, `sizes`: the memory of a topic, which the thread of the source writes.
 //! - [`program`]: the program `gleaner-ingress`.
 //!
-//! A reader is a stranger: nothing here waits for one, trusts a value that one can write, or opens
-//! a file for one. A sample is never copied for a reader.
+//! A reader is an untrusted peer: nothing here waits for one, trusts a value that one can write, or
+//! opens a file for one. A sample is never copied for a reader.
 
 mod engine;
 pub mod program;
@@ -24,8 +24,8 @@ mod topics;
 use std::io;
 use std::thread::{Builder, JoinHandle};
 
+use gleaner_messages::transport::LiveSource;
 use gleaner_protocol::ingress::{IngressControl, IngressReport, IngressServer};
-use gleaner_transport::LiveSource;
 
 pub use engine::{Ingress, Reports};
 

@@ -8,7 +8,7 @@ use std::time::Instant;
 /// Measurements, one in a second, that make a rate usual.
 const STEADY: u32 = 10;
 /// The lowest usual rate that is watched, in Hz: fewer samples than this are a matter of chance.
-const LEAST_HZ: f64 = 5.0;
+const MIN_HZ: f64 = 5.0;
 /// Low rates in a row from which on they are reported, and after which they are usual.
 const PATIENCE: u32 = 3;
 const ADOPTED: u32 = 60;
@@ -43,7 +43,7 @@ impl RateWatch {
         let passed_s = now.saturating_duration_since(at).as_secs_f64();
         let (now_hz, usual) = (received.saturating_sub(samples) as f64 / passed_s, self.usual_hz);
         let is_low = now_hz < usual / 2.0;
-        if is_low && usual >= LEAST_HZ && self.measured >= STEADY {
+        if is_low && usual >= MIN_HZ && self.measured >= STEADY {
             self.low += 1;
         } else if is_low || now_hz > usual * 2.0 {
             (self.usual_hz, self.measured, self.low) = (now_hz, 1, 0);

@@ -5,14 +5,14 @@ use std::io;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::time::{Duration, Instant};
 
-use gleaner_buffers::shared::{HAZARDS, HoldLimits};
+use gleaner_buffers::shared::{HAZARDS, PinLimits};
+use gleaner_messages::transport::{LiveSource, PublishError, Publisher};
 use gleaner_protocol::ingress::{
-    AddReader, HoldGrant, PublishGrant, ReaderLink, ReaderMessage, ReaderRequest, ReceptionStatus,
+    AddReader, PinGrant, PublishGrant, ReaderLink, ReaderMessage, ReaderRequest, ReceptionStatus,
     RefusedTopic, TopicGrant,
 };
 use gleaner_protocol::link::{Incoming, LinkError};
-use gleaner_regions::ControlRegion;
-use gleaner_transport::{LiveSource, PublishError, Publisher};
+use gleaner_samples::regions::ControlRegion;
 use tracing::warn;
 
 use crate::publish_rate::PublishRate;
@@ -112,18 +112,18 @@ impl ConnectedReader {
     }
 
     /// Gives out the hazard words of a topic; `None` if the control page lacks so many.
-    pub(crate) fn take_words(&mut self, holds: HoldGrant) -> Option<HoldLimits> {
-        let HoldGrant { windows, window, singles } = holds;
+    pub(crate) fn take_words(&mut self, holds: PinGrant) -> Option<PinLimits> {
+        let PinGrant { windows, window, singles } = holds;
         let end = self.words + u32::from(windows) + u32::from(singles);
         if end as usize > HAZARDS {
             return None;
         }
         let first_word = std::mem::replace(&mut self.words, end);
-        Some(HoldLimits { first_word, windows, window, singles })
+        Some(PinLimits { first_word, windows, window, singles })
     }
 
     /// Gives back the last words that were given out.
-    pub(crate) fn give_back(&mut self, limits: HoldLimits) {
+    pub(crate) fn give_back(&mut self, limits: PinLimits) {
         self.words = limits.first_word;
     }
 
@@ -141,7 +141,7 @@ impl ConnectedReader {
 
     /// Sends a message without the part that makes it too long: definitions, or a list of topics.
     fn send_shortened(&mut self, message: &ReaderMessage, descriptor: Option<BorrowedFd<'_>>) {
-        warn!(reader = self.name, "a message to a reader is too long: sent in part");
+        warn!(reader = self.name, "message to a reader too long: sent without its longest part");
         let mut message = message.clone();
         match &mut message {
             ReaderMessage::Attached(topic) => topic.definitions = None,
@@ -230,7 +230,7 @@ impl ConnectedReader {
 
     fn publish(&mut self, index: u32, cdr: &[u8]) {
         let Some(topic) = self.publishers.get(index as usize) else {
-            warn!(reader = self.name, index, "a reader publishes a topic that was not granted");
+            warn!(reader = self.name, index, "disconnected a reader: it may not publish a topic");
             self.is_gone = true;
             return;
         };
@@ -249,7 +249,7 @@ impl ConnectedReader {
         if let Err(error) = published {
             if self.unsent == 0 {
                 let (reader, error) = (&self.name, &error as &dyn std::error::Error);
-                warn!(reader, error, "a message was not published; further ones are counted");
+                warn!(reader, error, "cannot publish a message; further failures are only counted");
             }
             self.unsent += 1;
         }
@@ -258,7 +258,7 @@ impl ConnectedReader {
     fn disconnect(&mut self, error: &LinkError) {
         if !std::mem::replace(&mut self.is_gone, true) && !matches!(error, LinkError::Gone { .. }) {
             let error = error as &dyn std::error::Error;
-            warn!(reader = self.name, error, "a reader is disconnected");
+            warn!(reader = self.name, error, "disconnected a reader");
         }
     }
 }
@@ -273,7 +273,7 @@ fn open(reader: &str, grant: &PublishGrant, source: &dyn LiveSource) -> Publishe
     let opened = source.publisher(&grant.topic, &grant.type_name, grant.depth);
     if let Err(error) = &opened {
         let (topic, error) = (&grant.topic, error as &dyn std::error::Error);
-        warn!(reader, topic, error, "a topic cannot be published; its messages are counted");
+        warn!(reader, topic, error, "cannot publish a topic; its messages are dropped and counted");
     }
     PublishedTopic { publisher: opened.ok(), max_bytes: grant.max_bytes }
 }
@@ -283,7 +283,7 @@ mod tests {
     use std::io::Read;
     use std::os::unix::net::UnixStream;
 
-    use gleaner_transport::loopback::Loopback;
+    use gleaner_messages::transport::loopback::Loopback;
 
     use super::*;
 

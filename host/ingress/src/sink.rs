@@ -7,11 +7,13 @@ use std::collections::VecDeque;
 use std::os::fd::OwnedFd;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use gleaner_buffers::shared::{Bell, HoldLimits, ReaderId, SharedWriter, WriteError, WriterMemory};
-use gleaner_regions::{ControlRegion, KernelFutex, TopicRegion};
-use gleaner_transport::{
+use gleaner_buffers::shared::{
+    Notifier, PinLimits, ReaderId, SharedWriter, WriteError, WriterMemory,
+};
+use gleaner_messages::transport::{
     ArrivalSums, Delivery, Gaps, Guid, SampleMeta, Sink, StoredMeta, TopicCounters,
 };
+use gleaner_samples::regions::{ControlRegion, KernelFutex, TopicRegion};
 
 use crate::sizes::RegionSizes;
 
@@ -43,7 +45,7 @@ pub(crate) struct RegionWriter {
 
 struct RegionReader {
     id: ReaderId,
-    bell: Option<Bell>,
+    bell: Option<Notifier>,
     digests: bool,
 }
 
@@ -61,7 +63,7 @@ pub(crate) struct AttachedReader {
 
 pub(crate) struct AttachRequest<'a> {
     pub(crate) control: &'a ControlRegion,
-    pub(crate) limits: HoldLimits,
+    pub(crate) limits: PinLimits,
     pub(crate) depth: u32,
     pub(crate) wakes: bool,
     pub(crate) digests: bool,
@@ -99,7 +101,7 @@ impl RegionWriter {
         // From position 0 on, it receives all that the region has ever had.
         let is_all = request.is_latched && first == 0;
         let (digests, refused) = if is_all { (0, 0) } else { self.sums_before(first) };
-        let bell = request.wakes.then(|| Bell::of(request.control.clone()));
+        let bell = request.wakes.then(|| Notifier::of(request.control.clone()));
         self.readers.push(RegionReader { id, bell, digests: request.digests });
         Ok(AttachedReader { region: self.id, id, first, sizes: self.sizes, digests, refused })
     }
@@ -411,7 +413,7 @@ mod tests {
     }
 
     fn add(topic: &TopicSink, control: &ControlRegion, max_bytes: u64) {
-        let limits = HoldLimits { first_word: 0, windows: 0, window: 0, singles: 1 };
+        let limits = PinLimits { first_word: 0, windows: 0, window: 0, singles: 1 };
         let (wakes, digests, is_latched) = (false, false, false);
         let request = AttachRequest { control, limits, depth: 4, wakes, digests, is_latched };
         let (region, _) = RegionWriter::create(RegionSizes::of(max_bytes, true, 4, 1)).unwrap();
@@ -424,7 +426,7 @@ mod tests {
         let topic = Arc::new(TopicSink::default());
         let request = |digests, depth, word| AttachRequest {
             control: &control,
-            limits: HoldLimits { first_word: word, windows: 0, window: 0, singles: 1 },
+            limits: PinLimits { first_word: word, windows: 0, window: 0, singles: 1 },
             depth,
             wakes: false,
             digests,

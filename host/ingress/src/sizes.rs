@@ -11,11 +11,11 @@ const SPARE: std::ops::RangeInclusive<u64> = 2..=64;
 /// Readers with holds like the first one's that a region has room for, if its slots and bytes stay
 /// below these limits. They are reserved addresses: memory is used once readers hold samples.
 const READERS: u64 = 32;
-const MOST_SLOTS: u64 = 1 << 20;
-const MOST_RESERVED: u64 = 64 << 30;
+const MAX_SLOTS: u64 = 1 << 20;
+const MAX_RESERVED: u64 = 64 << 30;
 /// Most bytes of a region that are present from the start. Beyond, and where no reader states the
 /// size of samples, a slot is present once it was used: its first sample takes longer.
-const MOST_PRESENT: usize = 256 << 20;
+const MAX_PRESENT: usize = 256 << 20;
 
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct RegionSizes {
@@ -41,12 +41,12 @@ impl RegionSizes {
         let is_usual = |readers: &u64| {
             let layout = layout(*readers);
             let bytes = layout.bytes_needed().map_or(u64::MAX, |bytes| bytes as u64);
-            u64::from(layout.slots) <= MOST_SLOTS && bytes <= MOST_RESERVED
+            u64::from(layout.slots) <= MAX_SLOTS && bytes <= MAX_RESERVED
         };
         let readers = (1..=READERS).rev().find(is_usual).unwrap_or(1);
         let layout = layout(readers);
         let warm = u32::try_from(warm).unwrap_or(u32::MAX);
-        let present = layout.bytes_of_first(if is_stated { warm } else { 0 }).min(MOST_PRESENT);
+        let present = layout.bytes_of_first(if is_stated { warm } else { 0 }).min(MAX_PRESENT);
         Self { layout, warm, present }
     }
 }
@@ -88,8 +88,8 @@ mod tests {
     #[test]
     fn the_largest_grants_are_bounded() {
         let sizes = RegionSizes::of(1 << 30, true, 8, 16);
-        assert!(sizes.layout.bytes_needed().unwrap() as u64 <= MOST_RESERVED);
-        assert_eq!(sizes.present, MOST_PRESENT);
+        assert!(sizes.layout.bytes_needed().unwrap() as u64 <= MAX_RESERVED);
+        assert_eq!(sizes.present, MAX_PRESENT);
         let most = RegionSizes::of(1 << 30, true, 131_072, 16 * 65_535 + 2048);
         assert_eq!(u64::from(most.layout.slots), 131_072 + 1 + 2 + 16 * 65_535 + 2048);
     }

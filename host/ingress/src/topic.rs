@@ -5,10 +5,10 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use gleaner_buffers::shared::ReaderId;
-use gleaner_protocol::ingress::{IngressTopic, TopicGrant};
-use gleaner_transport::{
+use gleaner_messages::transport::{
     LiveSource, Qos, ReceptionStatus, Subscription, TopicSpec, TransportError, same_type,
 };
+use gleaner_protocol::ingress::{IngressTopic, TopicGrant};
 use tracing::{info, warn};
 
 use crate::rate_watch::RateWatch;
@@ -21,7 +21,7 @@ use crate::sizes::RegionSizes;
 /// second may find some writers later than others.
 const OVERLAP: Duration = Duration::from_secs(3);
 
-const MOST_WARNINGS: usize = 16;
+const MAX_WARNINGS: usize = 16;
 
 /// A topic with one subscription, or with two while one takes over from the other.
 pub(crate) struct SharedTopic {
@@ -241,7 +241,7 @@ impl SharedTopic {
         let warning = self.rate.note(&self.spec.topic, counts, Instant::now());
         // First, so that others leave it its place.
         status.qos_warnings.splice(..0, warning);
-        status.qos_warnings.truncate(MOST_WARNINGS);
+        status.qos_warnings.truncate(MAX_WARNINGS);
         self.sink.set_lost(status.lost);
         self.status = status;
     }

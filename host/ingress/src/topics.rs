@@ -4,10 +4,10 @@ use std::collections::BTreeMap;
 use std::os::fd::OwnedFd;
 use std::time::Instant;
 
-use gleaner_buffers::shared::HoldLimits;
+use gleaner_buffers::shared::PinLimits;
+use gleaner_messages::transport::{LiveSource, TopicSpec, TransportError};
 use gleaner_protocol::ingress::{RefusedTopic, TopicGrant};
-use gleaner_regions::ControlRegion;
-use gleaner_transport::{LiveSource, TopicSpec, TransportError};
+use gleaner_samples::regions::ControlRegion;
 
 use crate::sink::{AttachRequest, AttachedReader};
 use crate::sizes::usual_bytes;
@@ -22,16 +22,12 @@ pub(crate) struct TopicTable {
 
 impl TopicTable {
     /// Attaches a reader to the topic of a grant, of type `type_name`; returns the topic's key.
-    ///
-    /// # Errors
-    ///
-    /// The reason to send to the reader.
     pub(crate) fn attach(
         &mut self,
         source: &mut dyn LiveSource,
         grant: &TopicGrant,
         type_name: &str,
-        (control, limits): (&ControlRegion, HoldLimits),
+        (control, limits): (&ControlRegion, PinLimits),
     ) -> Result<(u64, AttachedReader), RefusedTopic> {
         let max_bytes = grant.max_bytes.unwrap_or_else(|| usual_bytes(type_name));
         let spec = TopicSpec {

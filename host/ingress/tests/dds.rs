@@ -1,20 +1,17 @@
 //! An ingress over DDS, with a publisher in the same process, in a network namespace.
 
-#[path = "../../dds/tests/dds/network_namespace.rs"]
-mod network_namespace;
-
 use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use gleaner_dds::{Dds, DdsOptions, Distro};
-use gleaner_feed::{FedTopic, Feed};
 use gleaner_ingress::Ingress;
+use gleaner_messages::transport::{LiveSource, StoredMeta};
 use gleaner_protocol::ingress::{
-    AddReader, HoldGrant, IngressControl, PublishGrant, Qos, TopicGrant,
+    AddReader, IngressControl, PinGrant, PublishGrant, Qos, TopicGrant,
 };
-use gleaner_transport::{LiveSource, StoredMeta};
-use network_namespace::Test;
+use gleaner_samples::{Feed, SharedTopicReader};
+use gleaner_test_support::network_namespace::{self, Test};
 
 const TYPE: &str = "std_msgs/msg/Empty";
 const TIMEOUT: Duration = Duration::from_secs(60);
@@ -42,13 +39,17 @@ fn grant(id: u32, topic: &str, max_bytes: u64) -> TopicGrant {
         queue: 100,
         max_bytes: Some(max_bytes),
         depth: 8192,
-        holds: HoldGrant { windows: 1, window: 8, singles: 4 },
+        holds: PinGrant { windows: 1, window: 8, singles: 4 },
         wakes: true,
         ..TopicGrant::default()
     }
 }
 
-fn attach(control: &mut IngressControl, name: &str, grant: TopicGrant) -> (Feed, FedTopic) {
+fn attach(
+    control: &mut IngressControl,
+    name: &str,
+    grant: TopicGrant,
+) -> (Feed, SharedTopicReader) {
     let add = AddReader { name: name.to_owned(), topics: vec![grant], publishes: Vec::new() };
     let mut feed = Feed::connect(control.add_reader(&add).unwrap()).unwrap();
     let topic = feed.topic(0, TIMEOUT).unwrap();
@@ -64,7 +65,7 @@ fn until(what: &str, mut is_it: impl FnMut() -> bool) {
 }
 
 /// Returns the sequence numbers of all samples of a topic.
-fn numbers(topic: &FedTopic) -> Vec<u64> {
+fn numbers(topic: &SharedTopicReader) -> Vec<u64> {
     let number = |position| {
         let sample = topic.reader.get(position).unwrap().expect("it is shown");
         StoredMeta::of_words(sample.meta()).sample.seq

@@ -15,15 +15,15 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use gleaner_buffers::shared::ControlMemory;
-use gleaner_feed::Feed;
 use gleaner_ingress::Ingress;
+use gleaner_messages::transport::loopback::Loopback;
+use gleaner_messages::transport::{Guid, SampleMeta, StoredMeta};
 use gleaner_protocol::ingress::{
-    AddReader, HoldGrant, IngressControl, IngressLink, PublishGrant, TopicGrant,
+    AddReader, IngressControl, IngressLink, PinGrant, PublishGrant, TopicGrant,
 };
 use gleaner_protocol::link::Incoming;
-use gleaner_regions::ControlRegion;
-use gleaner_transport::loopback::Loopback;
-use gleaner_transport::{Guid, SampleMeta, StoredMeta};
+use gleaner_samples::Feed;
+use gleaner_samples::regions::ControlRegion;
 use libtest_mimic::{Arguments, Trial};
 
 /// The variable with the role of a child of this program.
@@ -68,7 +68,7 @@ impl ReaderProcess {
             queue: 8,
             max_bytes: Some(8 * WORDS as u64),
             depth: 64,
-            holds: HoldGrant { windows: 2, window: 16, singles: 8 },
+            holds: PinGrant { windows: 2, window: 16, singles: 8 },
             wakes: true,
             digests: role == "verify",
             ..TopicGrant::default()

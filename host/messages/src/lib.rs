@@ -9,6 +9,8 @@
 //! No message, whatever its bytes claim, causes a panic or an allocation larger than itself. No
 //! message type is treated specially, apart from the two views and the header stamp. XCDR2 and
 //! parameter lists are not supported (ROS 2 uses classic CDR).
+//!
+//! [`transport`] has the traits of sources of such messages.
 
 mod cdr;
 mod definitions;
@@ -19,6 +21,7 @@ mod path;
 mod program;
 mod sources;
 mod stamp;
+pub mod transport;
 pub mod type_description;
 mod value;
 mod views;

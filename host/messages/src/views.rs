@@ -41,10 +41,6 @@ pub fn is_viewed(definitions: &Definitions) -> bool {
 
 impl<'a> ImageView<'a> {
     /// Reads a whole `sensor_msgs/msg/Image`.
-    ///
-    /// # Errors
-    ///
-    /// [`CdrError`] if the bytes are not such a message.
     pub fn read(cdr: &'a [u8], endian: Endian) -> Result<Self, CdrError> {
         let mut cursor = Cursor::new(cdr, endian);
         skip_header(&mut cursor)?;
@@ -58,10 +54,6 @@ impl<'a> ImageView<'a> {
 
 impl<'a> CompressedView<'a> {
     /// Reads a whole `sensor_msgs/msg/CompressedImage`.
-    ///
-    /// # Errors
-    ///
-    /// [`CdrError`] if the bytes are not such a message.
     pub fn read(cdr: &'a [u8], endian: Endian) -> Result<Self, CdrError> {
         let mut cursor = Cursor::new(cdr, endian);
         skip_header(&mut cursor)?;

@@ -1,9 +1,10 @@
-//! Exposes the pixels of a frame, and tensors, as read-only numpy arrays without copying.
+//! Exposes the pixels of a frame, and tensors, as read-only numpy arrays without copying. The
+//! classes of the objects that hold their memory are here.
 #![allow(unsafe_code)]
 
 use std::ptr;
 
-use gleaner_host::api::frame::Info;
+use gleaner_host::api::frame::{self, Info};
 use gleaner_host::api::inference::TensorContent;
 use gleaner_protocol::inference::Element;
 use numpy::npyffi::{NpyTypes, PY_ARRAY_API, get_type_object, npy_intp};
@@ -11,8 +12,25 @@ use numpy::{PyArrayDescr, PyArrayDescrMethods, dtype};
 use pyo3::exceptions::PyBufferError;
 use pyo3::prelude::*;
 
-use crate::frame::Frame;
-use crate::inference::TensorBytes;
+/// A sample seen as an image. Never give out `&mut` to its content: arrays over its pixels rely on
+/// that.
+#[pyclass(frozen, module = "_gleaner")]
+pub(crate) struct Frame(frame::Frame);
+
+impl Frame {
+    pub(crate) fn new(inner: frame::Frame) -> Self {
+        Self(inner)
+    }
+
+    pub(crate) fn host(&self) -> &frame::Frame {
+        &self.0
+    }
+}
+
+/// The bytes of a tensor, which the arrays over them hold. Never give out `&mut` to its content:
+/// those arrays rely on that.
+#[pyclass(frozen, module = "_gleaner")]
+pub(crate) struct TensorBytes(pub(crate) TensorContent);
 
 /// Memory layout of an array over a frame.
 struct Layout {

@@ -10,7 +10,7 @@ use pyo3::exceptions::PyTypeError;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict, PyString};
 
-use crate::frame::Frame;
+use crate::array::Frame;
 use crate::sdk::SdkClass;
 
 static DATA_ERROR: SdkClass = SdkClass::new("gleaner.data", "DataError");

@@ -1,59 +1,44 @@
 //! Frames of `gleaner:lambda/data` over `gleaner_host::api::frame`.
 
-use gleaner_host::api::frame::{self, Info};
-use gleaner_image::{Encoding, Roi};
+use gleaner_host::api::frame::Info;
+use gleaner_pixels::{Encoding, Roi};
 use numpy::PyArray1;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict, PyTuple};
 
-use crate::array;
+use crate::array::{self, Frame};
 use crate::data::{identity, refused, stamps};
 use crate::sdk::SdkClass;
 
 static FRAME_INFO: SdkClass = SdkClass::new("gleaner.data", "FrameInfo");
 
-/// A sample seen as an image. Its content is never replaced while the object lives: arrays over its
-/// pixels rely on that.
-#[pyclass(frozen, module = "_gleaner")]
-pub(crate) struct Frame(frame::Frame);
-
 /// `x`, `y`, `width`, `height`: a `gleaner.Roi` is such a tuple.
 type RoiFields = (u32, u32, u32, u32);
-
-impl Frame {
-    pub(crate) fn new(inner: frame::Frame) -> Self {
-        Self(inner)
-    }
-
-    pub(crate) fn host(&self) -> &frame::Frame {
-        &self.0
-    }
-}
 
 // Operations on pixels take up to milliseconds, in which other threads of the lambda may run.
 #[pymethods]
 impl Frame {
     #[getter]
     fn info<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        let Info { width, height, encoding, step, big_endian } = self.0.info();
-        let size = self.0.bytes().len();
+        let Info { width, height, encoding, step, big_endian } = self.host().info();
+        let size = self.host().bytes().len();
         FRAME_INFO.make(py, (width, height, name(encoding), step, big_endian, size))
     }
 
     #[getter]
     fn identity<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        identity(py, self.0.identity())
+        identity(py, self.host().identity())
     }
 
     #[getter]
     fn stamps<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        stamps(py, self.0.stamps())
+        stamps(py, self.host().stamps())
     }
 
     #[pyo3(signature = (roi = None))]
     fn mean_luma(&self, py: Python<'_>, roi: Option<RoiFields>) -> PyResult<f64> {
         let roi = roi.map(region);
-        py.detach(|| self.0.mean_luma(roi)).map_err(|error| refused(py, error))
+        py.detach(|| self.host().mean_luma(roi)).map_err(|error| refused(py, error))
     }
 
     #[pyo3(signature = (roi = None))]
@@ -63,16 +48,19 @@ impl Frame {
         roi: Option<RoiFields>,
     ) -> PyResult<Bound<'py, PyArray1<u32>>> {
         let roi = roi.map(region);
-        let counts = py.detach(|| self.0.histogram(roi)).map_err(|error| refused(py, error))?;
+        let counts =
+            py.detach(|| self.host().histogram(roi)).map_err(|error| refused(py, error))?;
         Ok(PyArray1::from_slice(py, &counts))
     }
 
     fn resize(&self, py: Python<'_>, width: u32, height: u32) -> PyResult<Self> {
-        py.detach(|| self.0.resize(width, height)).map(Self).map_err(|error| refused(py, error))
+        py.detach(|| self.host().resize(width, height))
+            .map(Self::new)
+            .map_err(|error| refused(py, error))
     }
 
     fn to_gray(&self, py: Python<'_>) -> PyResult<Self> {
-        py.detach(|| self.0.to_gray()).map(Self).map_err(|error| refused(py, error))
+        py.detach(|| self.host().to_gray()).map(Self::new).map_err(|error| refused(py, error))
     }
 
     #[pyo3(signature = (offset = 0, len = None))]
@@ -82,8 +70,10 @@ impl Frame {
         offset: u64,
         len: Option<u32>,
     ) -> PyResult<Bound<'py, PyBytes>> {
-        let bytes =
-            self.0.read(offset, len.unwrap_or(u32::MAX)).map_err(|error| refused(py, error))?;
+        let bytes = self
+            .host()
+            .read(offset, len.unwrap_or(u32::MAX))
+            .map_err(|error| refused(py, error))?;
         Ok(PyBytes::new(py, &bytes))
     }
 
@@ -113,8 +103,8 @@ impl Frame {
     }
 
     fn __repr__(&self) -> String {
-        let Info { width, height, encoding, .. } = self.0.info();
-        format!("<Frame {}, {width}x{height} {}>", self.0.identity().topic, name(encoding))
+        let Info { width, height, encoding, .. } = self.host().info();
+        format!("<Frame {}, {width}x{height} {}>", self.host().identity().topic, name(encoding))
     }
 }
 

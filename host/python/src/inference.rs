@@ -7,15 +7,14 @@ use gleaner_host::api::Session;
 use gleaner_host::api::inference::{
     self, DetectOptions, InferenceError, InferenceErrorKind, TensorContent,
 };
+use gleaner_pixels::vision::{Detection, Placement, Preprocess};
 use gleaner_protocol::inference::{Element, TensorInfo};
-use gleaner_vision::{Detection, Placement, Preprocess};
 use numpy::PyReadonlyArray1;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 
-use crate::array;
-use crate::frame::Frame;
+use crate::array::{self, Frame, TensorBytes};
 use crate::scratch::to_bytes;
 use crate::sdk::SdkClass;
 
@@ -31,10 +30,6 @@ pub(crate) struct Tensor(Mutex<inference::Tensor>);
 
 #[pyclass(frozen, module = "_gleaner")]
 pub(crate) struct Model(inference::Model);
-
-/// The bytes of a tensor, which the arrays over them hold.
-#[pyclass(frozen, module = "_gleaner")]
-pub(crate) struct TensorBytes(pub(crate) TensorContent);
 
 /// Name, element type and shape of an input or output.
 type InfoFields = (String, &'static str, Vec<Option<u32>>);

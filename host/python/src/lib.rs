@@ -30,11 +30,11 @@ mod _gleaner {
     use super::*;
 
     #[pymodule_export]
+    use super::array::Frame;
+    #[pymodule_export]
     use super::context::Context;
     #[pymodule_export]
     use super::data::{Field, Sample, Topic};
-    #[pymodule_export]
-    use super::frame::Frame;
     #[pymodule_export]
     use super::guest::{main, time_left};
     #[pymodule_export]

@@ -4,7 +4,7 @@
 
 use std::alloc::{GlobalAlloc, Layout, System};
 
-use gleaner_vitals::{Pulse, own};
+use gleaner_protocol::process_stats::{Heartbeat, own};
 
 struct CountingAllocator;
 
@@ -43,7 +43,7 @@ unsafe impl GlobalAlloc for CountingAllocator {
 /// Counts `memory`, or reports to the shim that none is left; returns `memory`.
 fn counted(memory: *mut u8, bytes: usize) -> *mut u8 {
     if memory.is_null() {
-        Pulse::report_refused_memory();
+        Heartbeat::report_refused_memory();
     } else {
         own::allocated(bytes);
     }

@@ -8,7 +8,7 @@ use std::path::PathBuf;
 use gleaner_base::safe_file::UnsafePath;
 use gleaner_base::{Exit, Explain};
 use gleaner_drives::ReplayError;
-use gleaner_transport::TransportError;
+use gleaner_messages::transport::TransportError;
 
 #[derive(Debug, thiserror::Error)]
 pub enum RecordError {

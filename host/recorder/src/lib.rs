@@ -13,10 +13,6 @@
 //! of samples and wakes only. A live recorder is the same, except that a thread writes the files.
 //! Never here: running a lambda, or deciding what is worth keeping.
 
-// The unit tests share support code with the integration tests.
-#[cfg(test)]
-extern crate self as gleaner_recorder;
-
 mod digest;
 mod error;
 mod file;
@@ -24,16 +20,13 @@ mod preroll;
 #[cfg(feature = "program")]
 pub mod program;
 mod recorder;
-#[cfg(test)]
-#[path = "../tests/suite/support/mod.rs"]
-mod support;
 mod thumbnail;
 mod window;
 
 pub use digest::lambda_digest;
 pub use error::RecordError;
 pub use file::{
-    ClipStatements, EarlierClips, FalseStatement, LossList, MESSAGE_MAX, RecordingFolder,
+    ClaimMismatch, ClipStatements, EarlierClips, LossList, MESSAGE_MAX, RecordingFolder,
     TopicSchema,
 };
 pub use recorder::{

@@ -1,7 +1,7 @@
 //! Creates a small JPEG from an image message, for lists of clips.
 
-use gleaner_image::{self as image, Encoding, ImageHeader, StopCheck, View, ops};
 use gleaner_messages::{CompressedView, Endian, ImageView};
+use gleaner_pixels::{self as image, Encoding, ImageHeader, StopCheck, View, ops};
 use jpeg_encoder::{ColorType, Encoder};
 
 /// Greatest width of a thumbnail, in pixels.
@@ -197,9 +197,9 @@ mod tests {
 
     /// Width, height and mean colour of a JPEG.
     fn seen(jpeg: &[u8]) -> (u32, u32, [u8; 3]) {
-        let header = gleaner_image::probe(jpeg).unwrap();
+        let header = gleaner_pixels::probe(jpeg).unwrap();
         let mut pixels = vec![0; header.rgb8_len().unwrap()];
-        gleaner_image::decode_rgb8(jpeg, &header, pixels.len(), &mut pixels).unwrap();
+        gleaner_pixels::decode_rgb8(jpeg, &header, pixels.len(), &mut pixels).unwrap();
         let mut sums = [0_u64; 3];
         for pixel in pixels.as_chunks::<3>().0 {
             for (sum, value) in sums.iter_mut().zip(pixel) {

@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use gleaner_lambda::signals::{Curve, Signals};
 
-use super::data::{Column, Topic};
+use super::values::Column;
 
 /// Maximum number of distinct paths without a curve that are counted.
 const OMITTED_MAX: usize = 1000;
@@ -30,19 +30,15 @@ struct CurveKey {
 }
 
 impl Curves {
-    /// Starts to record the values of fields of `inputs` that are compiled from now on.
-    pub fn of(inputs: &[Arc<Topic>]) -> Arc<Self> {
-        let curves = Arc::new(Self::default());
-        for topic in inputs {
-            topic.record_curves(&curves);
-        }
-        curves
-    }
-
-    /// The writer of the curve of `path` in the messages of `topic`; `None` if there are too many.
-    pub(super) fn curve_writer(&self, topic: &Topic, path: String) -> Option<Arc<CurveWriter>> {
-        let source =
-            CurveKey { input: topic.name().to_owned(), topic: topic.ros_topic().to_owned(), path };
+    /// The writer of the curve of `path` in the messages of `topic`, which is `input`; `None` if
+    /// there are too many.
+    pub(super) fn curve_writer(
+        &self,
+        input: &str,
+        topic: &str,
+        path: String,
+    ) -> Option<Arc<CurveWriter>> {
+        let source = CurveKey { input: input.to_owned(), topic: topic.to_owned(), path };
         let mut list = self.lock();
         if let Some((_, writer)) = list.kept.iter().find(|(kept, _)| *kept == source) {
             return Some(Arc::clone(writer));

@@ -8,23 +8,24 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use gleaner_buffers::shared::SharedReader;
 use gleaner_buffers::{Lease, RingCounts, RingReader};
+use gleaner_messages::transport::StoredMeta;
 use gleaner_messages::{CdrError, Definitions, FieldPath, HeaderStamp, header_stamp, is_viewed};
 use gleaner_rules::clamps::{self, WrongField};
 pub use gleaner_rules::clamps::{PATH_BYTES, SAMPLES_PER_CALL, TEXTS_PER_FIELD};
-use gleaner_transport::StoredMeta;
 
 pub use super::call::{Due, PerCall};
 use super::curves::{CurveWriter, Curves};
 pub use super::error::{DataError, DataErrorKind};
 use super::field::FIELD_BYTES;
 pub use super::field::Field;
-use super::frame::{ImageMessage, Images};
 use super::fuel::Fuel;
 pub use super::fuel::OutOfFuel;
-use super::inference::TensorLimits;
+use super::images::{ImageMessage, Images};
 use super::live_layout::LiveLayout;
+use super::look_back::LookBack;
+pub use super::look_back::SumsBefore;
 pub use super::sample::Sample;
-use super::trace::{LookBack, SumsBefore};
+use super::tensor::TensorLimits;
 pub use super::values::{Column, Counts, Identity, Stamps, Tick};
 
 /// Samples of a column, and bytes of samples that are parsed, between two checks of the deadline.
@@ -164,11 +165,7 @@ impl Topic {
     }
 
     /// Returns the samples received later than `since_ns`, oldest first; at most as many of the
-    /// newest as [`Topic::last`] returns.
-    ///
-    /// # Errors
-    ///
-    /// As [`Topic::last`].
+    /// newest as [`Topic::last`] returns, and with its errors.
     pub fn since(self: &Arc<Self>, since_ns: i64) -> Result<Vec<Sample>, DataError> {
         let mut leases = Vec::new();
         let most = self.per_call.clamps().samples().min(self.depth);
@@ -229,11 +226,7 @@ impl Topic {
     }
 
     /// Returns `field` of all samples received later than `since_ns`; at most `call_items` of
-    /// `[limits]`.
-    ///
-    /// # Errors
-    ///
-    /// As [`Topic::column`].
+    /// `[limits]`. Fails as [`Topic::column`].
     pub fn column_since(
         self: &Arc<Self>,
         field: &Field,
@@ -297,15 +290,10 @@ impl Topic {
         Ok(column)
     }
 
-    /// Records values of fields that are compiled from now on in `curves`.
-    pub(super) fn record_curves(&self, curves: &Arc<Curves>) {
-        // The first request wins.
-        let _ = self.curves.set(Arc::clone(curves));
-    }
-
     /// The writer of the curve of this name, if curves are recorded.
     pub(super) fn curve_writer(&self, name: impl FnOnce() -> String) -> Option<Arc<CurveWriter>> {
-        self.curves.get().and_then(|curves| curves.curve_writer(self, name()))
+        let curves = self.curves.get()?;
+        curves.curve_writer(&self.input, &self.topic, name())
     }
 
     pub(super) fn number(
@@ -458,6 +446,16 @@ impl Topic {
         let refused = self.sums_before.refused + self.reader.counts().too_big;
         SumsBefore { digest, refused }
     }
+}
+
+/// Starts to record the values of fields of `inputs` that are compiled from now on.
+pub(crate) fn record_curves(inputs: &[Arc<Topic>]) -> Arc<Curves> {
+    let curves = Arc::new(Curves::default());
+    for topic in inputs {
+        // The first request wins.
+        let _ = topic.curves.set(Arc::clone(&curves));
+    }
+    curves
 }
 
 /// The cause of a wake.

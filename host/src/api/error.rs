@@ -1,7 +1,7 @@
 //! Errors of reads, with texts for the lambda's author.
 
-use gleaner_image::ImageError;
 use gleaner_messages::{CdrError, PathError};
+use gleaner_pixels::ImageError;
 use gleaner_rules::clamps::WrongField;
 use gleaner_rules::frames::NoRoom;
 use gleaner_rules::refused;
@@ -40,7 +40,7 @@ pub enum DataError {
          keep fewer"
     )]
     OutOfHolds { input: String },
-    #[error("the deadline is over")]
+    #[error("the deadline has passed")]
     OutOfTime,
     #[error(transparent)]
     OutOfFuel(#[from] OutOfFuel),

@@ -48,20 +48,12 @@ impl Fuel {
     }
 
     /// Charges one call that only reads a value.
-    ///
-    /// # Errors
-    ///
-    /// [`OutOfFuel`].
     pub fn charge_call(&self) -> Result<(), OutOfFuel> {
         self.charge(|| 0)
     }
 
     /// Charges one call that touches `bytes` bytes, which are not computed for a guest without an
     /// allowance.
-    ///
-    /// # Errors
-    ///
-    /// [`OutOfFuel`].
     pub fn charge(&self, bytes: impl FnOnce() -> usize) -> Result<(), OutOfFuel> {
         if self.0.allowed.load(Ordering::Relaxed) == ENDLESS {
             return Ok(());
@@ -70,10 +62,6 @@ impl Fuel {
     }
 
     /// Charges one call that takes as long as `units` instructions.
-    ///
-    /// # Errors
-    ///
-    /// [`OutOfFuel`].
     pub fn charge_units(&self, units: u64) -> Result<(), OutOfFuel> {
         let used = self.used().saturating_add(FUEL_PER_CALL).saturating_add(units);
         self.0.used.store(used, Ordering::Relaxed);

@@ -4,9 +4,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use gleaner_base::visible;
+use gleaner_pixels::vision::{Detection, DetectorLayout, Preprocess, VisionError, Wanted};
 use gleaner_protocol::inference::{Element, ModelFaultKind, TensorInfo, TensorPlace};
 use gleaner_rules::refused;
-use gleaner_vision::{Detection, DetectorLayout, Preprocess, VisionError, Wanted};
 
 use super::frame::Frame;
 use super::fuel::OutOfFuel;
@@ -31,7 +31,7 @@ pub enum InferenceError {
     Failed(String),
     #[error("gleaner-inference has just been started again")]
     Restarted,
-    #[error("the deadline is over")]
+    #[error("the deadline has passed")]
     OutOfTime,
     #[error(transparent)]
     OutOfFuel(#[from] OutOfFuel),
@@ -124,10 +124,6 @@ pub struct Model {
 
 impl Model {
     /// Opens the `[[model]]` of the manifest with this name.
-    ///
-    /// # Errors
-    ///
-    /// [`InferenceError`].
     pub fn open(
         models: &Models,
         limits: &TensorLimits,
@@ -150,7 +146,6 @@ impl Model {
         &self.opened.outputs
     }
 
-    /// Names of its classes.
     pub fn labels(&self) -> &[String] {
         &self.entry.labels
     }
@@ -161,10 +156,6 @@ impl Model {
     }
 
     /// Runs it once with these inputs; returns its outputs by name.
-    ///
-    /// # Errors
-    ///
-    /// [`InferenceError`].
     pub fn run(
         &self,
         inputs: &[(String, TensorContent)],
@@ -205,10 +196,6 @@ impl Model {
     }
 
     /// Finds objects in a frame.
-    ///
-    /// # Errors
-    ///
-    /// [`InferenceError`].
     pub fn detect(
         &self,
         frame: &Frame,
@@ -232,7 +219,7 @@ impl Model {
             &per_call.due,
             |preparer, bytes| self.limits.prepare(preparer, frame, &how, bytes),
             |placed, outputs| {
-                let found = gleaner_vision::detect(layout, outputs, &placed, &wanted);
+                let found = gleaner_pixels::vision::detect(layout, outputs, &placed, &wanted);
                 found
                     .map_err(|error| InferenceError::WrongInput(format!("model `{name}`: {error}")))
             },

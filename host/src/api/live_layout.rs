@@ -3,7 +3,7 @@
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use gleaner_transport::SampleMeta;
+use gleaner_messages::transport::SampleMeta;
 
 use super::data::Topic;
 

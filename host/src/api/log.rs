@@ -67,10 +67,6 @@ impl Log {
 
 impl Session {
     /// Writes one line at the time of this wake.
-    ///
-    /// # Errors
-    ///
-    /// [`OutOfFuel`].
     pub fn log(&self, level: Level, message: &str) -> Result<(), OutOfFuel> {
         self.fuel.charge(|| message.len())?;
         self.write(level, message);

@@ -21,6 +21,7 @@ mod images;
 pub mod inference;
 pub(crate) mod live_layout;
 pub mod log;
+mod look_back;
 pub mod models;
 pub mod relayed;
 mod sample;
@@ -42,10 +43,10 @@ use data::{DataError, Due, Topic};
 use field::FIELD_BYTES;
 use fuel::{Fuel, OutOfFuel};
 use gleaner_rules::frames::Budget;
-use inference::TensorLimits;
 use log::{Log, LogLine};
 use models::Models;
 use scratch::Scratch;
+use tensor::TensorLimits;
 use trigger::Triggers;
 
 /// Inputs, triggers, log and scratch of one lambda, shared with its guest. One lock, held for the
@@ -174,7 +175,6 @@ impl Session {
         &self.fuel
     }
 
-    /// Time of this wake, in nanoseconds.
     pub fn now_ns(&self) -> i64 {
         self.lock().now_ns
     }
@@ -190,10 +190,6 @@ impl Session {
     }
 
     /// Names of all inputs, in the manifest's order.
-    ///
-    /// # Errors
-    ///
-    /// [`OutOfFuel`].
     pub fn input_names(&self) -> Result<Vec<String>, OutOfFuel> {
         let state = self.lock();
         self.fuel.charge(|| state.inputs.len() * FIELD_BYTES)?;

@@ -9,13 +9,13 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use gleaner_base::chain;
+use gleaner_pixels::vision::{DetectorLayout, ExportNote, OutputView, Preparer};
 use gleaner_protocol::inference::{
     Element, MAX_TENSOR_BYTES, ModelCall, ModelClient, ModelFault, ModelReply, ModelResult,
     ModelWait, TENSOR_ALIGNMENT, TensorInfo, TensorPlace,
 };
 use gleaner_protocol::link::LinkError;
-use gleaner_vision::{DetectorLayout, ExportNote, OutputView, Preparer};
-use gleaner_vitals::monotonic_ns;
+use gleaner_protocol::process_stats::monotonic_ns;
 use zerocopy::IntoBytes;
 
 use super::call::Due;
@@ -38,7 +38,6 @@ const RUNTIME_MAX: usize = 256;
 pub struct ModelEntry {
     pub name: String,
     pub layout: Option<DetectorLayout>,
-    /// Names of its classes.
     pub labels: Vec<String>,
 }
 
@@ -229,7 +228,7 @@ impl ModelsState {
         loop {
             match self.open(name, Some(Instant::now() + timeout)) {
                 Err(InferenceError::Queued(reason)) if Instant::now() < latest => {
-                    tracing::warn!(reason, "a model waits for its load");
+                    tracing::warn!(reason, "waiting for model to load");
                     began_late = true;
                 }
                 // Its load began within this time, and gets its own.

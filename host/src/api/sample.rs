@@ -3,12 +3,13 @@
 use std::sync::Arc;
 
 use gleaner_buffers::Lease;
+use gleaner_messages::transport::{SampleMeta, StoredMeta};
 use gleaner_messages::{Endian, MessageValue};
 use gleaner_rules::clamps::Length;
-use gleaner_transport::{SampleMeta, StoredMeta};
 
 use super::data::{DataError, Field, Topic};
-use super::frame::{Frame, ImageMessage};
+use super::frame::Frame;
+use super::images::ImageMessage;
 use super::shared_bytes::SharedBytes;
 use super::values::{Identity, Stamps};
 
@@ -69,11 +70,7 @@ impl Sample {
         Ok(value)
     }
 
-    /// Returns the value of a numeric or boolean field.
-    ///
-    /// # Errors
-    ///
-    /// As [`Topic::column`].
+    /// Returns the value of a numeric or boolean field. Fails as [`Topic::column`].
     pub fn number(&self, field: &Field) -> Result<f64, DataError> {
         self.topic.per_call.charge(|| field.work(self.lease.len()))?;
         field.must_belong_to(&self.topic)?;

@@ -66,42 +66,28 @@ impl Session {
         Ok(self.lock().scratch.put(name, bytes)?)
     }
 
-    /// Appends `bytes` to the entry of that name, or creates it.
-    ///
-    /// # Errors
-    ///
-    /// As [`Session::put`].
+    /// Appends `bytes` to the entry of that name, or creates it. Fails as [`Session::put`]:
+    /// nothing has changed then.
     pub fn append(&self, name: &str, bytes: &[u8]) -> Result<(), ScratchError> {
         self.fuel.charge(|| name.len() + bytes.len())?;
         Ok(self.lock().scratch.append(name, bytes)?)
     }
 
     /// Bytes from `offset`, `len` at most; clamped to the entry, and to `call_bytes` of `[limits]`.
-    ///
-    /// # Errors
-    ///
-    /// [`ScratchError`] if there is no such entry.
+    /// Fails if there is no such entry.
     pub fn get(&self, name: &str, offset: u64, len: u64) -> Result<Vec<u8>, ScratchError> {
         let got = self.lock().scratch.get(name, offset, len);
         self.fuel.charge(|| name.len() + got.as_ref().map_or(0, Vec::len))?;
         Ok(got?)
     }
 
-    /// Removes the entry of a name.
-    ///
-    /// # Errors
-    ///
-    /// [`ScratchError`] if there is no such entry.
+    /// Removes the entry of a name. Fails if there is no such entry.
     pub fn remove(&self, name: &str) -> Result<(), ScratchError> {
         self.fuel.charge(|| name.len())?;
         Ok(self.lock().scratch.remove(name)?)
     }
 
     /// All entries, in the order of the names' bytes.
-    ///
-    /// # Errors
-    ///
-    /// [`OutOfFuel`].
     pub fn entries(&self) -> Result<Vec<Entry>, OutOfFuel> {
         let entries = self.lock().scratch.entries();
         self.fuel.charge(|| entries.iter().map(|entry| LISTED_BYTES + entry.name.len()).sum())?;

@@ -4,10 +4,10 @@ use std::ops::Deref;
 use std::sync::Arc;
 
 use gleaner_buffers::Lease;
+use gleaner_messages::transport::StoredMeta;
 use gleaner_rules::clamps;
-use gleaner_transport::StoredMeta;
 
-use super::frame::Info;
+use super::images::Info;
 
 /// A range of immutable bytes, shared with their owner without a copy.
 #[derive(Clone)]

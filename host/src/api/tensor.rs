@@ -2,14 +2,14 @@
 
 use std::sync::Arc;
 
+use gleaner_pixels::vision::{Placed, Preparer, Preprocess};
 use gleaner_protocol::inference::{Element, MAX_DIMENSIONS, MAX_TENSOR_BYTES, TensorPlace};
 use gleaner_rules::clamps;
 use gleaner_rules::frames::{Budget, FrameLease};
 use gleaner_rules::pixels::StopCheck;
-use gleaner_vision::{Placed, Preparer, Preprocess};
 
 use super::call::PerCall;
-use super::data::DataError;
+use super::error::DataError;
 use super::frame::Frame;
 use super::fuel::OutOfFuel;
 use super::inference::InferenceError;
@@ -175,10 +175,6 @@ impl Tensor {
     }
 
     /// Bytes from `offset`, `len` at most, clamped to the tensor and to `call_bytes` of `[limits]`.
-    ///
-    /// # Errors
-    ///
-    /// [`OutOfFuel`].
     pub fn read(&self, offset: u64, len: u32) -> Result<&[u8], OutOfFuel> {
         let len = self.per_call.clamps().bytes.min(len as usize);
         let bytes = &self.content.bytes;

@@ -1,62 +1,16 @@
 //! Traces one topic for the journal: the samples since the previous wake, and how far back the
 //! lambda looked.
 
-use std::sync::atomic::{AtomicU64, Ordering};
-
-use gleaner_buffers::{Lease, RingCounts};
+use gleaner_buffers::RingCounts;
 use gleaner_journal::InputView;
-use gleaner_transport::StoredMeta;
+use gleaner_messages::transport::StoredMeta;
 
-use super::data::Topic;
-
-/// Value for a wake that looked at no sample.
-const NONE: u64 = u64::MAX;
+use super::data::{SumsBefore, Topic};
 
 /// Number of samples of `topic` so far, including refused ones.
 pub fn offered(topic: &Topic) -> u64 {
     let RingCounts { received, no_slot, too_big, .. } = topic.reader().counts();
     received + no_slot + too_big
-}
-
-/// The oldest sample at which the lambda has looked in this wake. Only its thread writes it.
-pub(super) struct LookBack(AtomicU64);
-
-impl Default for LookBack {
-    fn default() -> Self {
-        Self(AtomicU64::new(NONE))
-    }
-}
-
-impl LookBack {
-    pub(super) fn reset(&self) {
-        self.0.store(NONE, Ordering::Relaxed);
-    }
-
-    /// Position of the oldest sample that a call returned.
-    pub(super) fn oldest(&self) -> Option<u64> {
-        Some(self.0.load(Ordering::Relaxed)).filter(|position| *position != NONE)
-    }
-
-    /// Notes the oldest of the samples that a call returns.
-    pub(super) fn at(&self, oldest: Option<&Lease<StoredMeta>>) {
-        if let Some(position) = oldest.and_then(Lease::position) {
-            self.at_position(position);
-        }
-    }
-
-    pub(super) fn at_position(&self, position: u64) {
-        if position < self.0.load(Ordering::Relaxed) {
-            self.0.store(position, Ordering::Relaxed);
-        }
-    }
-}
-
-/// Sums over the samples before the first one of a ring: another process may have filled it before.
-#[derive(Copy, Clone, Debug, Default)]
-pub struct SumsBefore {
-    /// Sum of their digests, modulo 2^32.
-    pub digest: u32,
-    pub refused: u64,
 }
 
 /// Traces the visible samples of one topic from wake to wake.
@@ -125,8 +79,8 @@ impl Trace {
     /// Notes how far back the lambda looked; call it after each wake. `woken_by` is the position of
     /// the sample that caused it, if it is one of this topic.
     pub fn end(&self, topic: &Topic, woken_by: Option<u64>, seen: &mut InputView) {
-        let oldest = topic.look_back.0.load(Ordering::Relaxed).min(woken_by.unwrap_or(NONE));
-        seen.reach = self.until.saturating_sub(oldest);
+        let oldest = [topic.look_back.oldest(), woken_by].into_iter().flatten().min();
+        seen.reach = oldest.map_or(0, |oldest| self.until.saturating_sub(oldest));
     }
 }
 

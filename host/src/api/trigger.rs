@@ -73,20 +73,14 @@ impl Session {
         self.cause(TriggerKind::Event, label, Some(score), attributes)
     }
 
-    /// Starts a recording that lasts until [`Session::stop`] with the same label.
-    ///
-    /// # Errors
-    ///
-    /// As [`Session::event`].
+    /// Starts a recording that lasts until [`Session::stop`] with the same label. Fails as
+    /// [`Session::event`]: there is no trigger then.
     pub fn start(&self, label: &str, attributes: Vec<Attribute>) -> Result<(), TriggerError> {
         self.cause(TriggerKind::Start, label, None, attributes)
     }
 
-    /// Ends the recording that [`Session::start`] began.
-    ///
-    /// # Errors
-    ///
-    /// As [`Session::event`].
+    /// Ends the recording that [`Session::start`] began. Fails as [`Session::event`]: there is
+    /// no trigger then.
     pub fn stop(&self, label: &str) -> Result<(), TriggerError> {
         self.cause(TriggerKind::Stop, label, None, Vec::new())
     }

@@ -1,7 +1,7 @@
 //! Plain values returned to a lambda.
 
+use gleaner_messages::transport::Guid;
 pub use gleaner_rules::schedule::Tick;
-use gleaner_transport::Guid;
 use serde::{Deserialize, Serialize};
 
 /// Counts of a topic's samples since the lambda started.

@@ -8,8 +8,8 @@ use std::io;
 use std::time::{Duration, Instant};
 
 use gleaner_lambda::{Fault, FaultKind};
-use gleaner_vitals::usage::{PrivatePages, ProcessUsage};
-use gleaner_vitals::{Pulse, Share, own};
+use gleaner_protocol::process_stats::usage::{PrivatePages, ProcessUsage};
+use gleaner_protocol::process_stats::{Heartbeat, Share, own};
 
 /// Shortest time between two measurements. One takes about a microsecond, and a wake of a fast
 /// replay seven.
@@ -24,7 +24,7 @@ pub(super) struct Meter {
 impl Meter {
     /// Counts the memory that the process allocates from now on; `most` bytes of it are allowed to
     /// the lambda. The shim counts, too.
-    pub(super) fn start(most: u64, pulse: &Pulse) -> io::Result<Self> {
+    pub(super) fn start(most: u64, heartbeat: &Heartbeat) -> io::Result<Self> {
         let unreadable = || io::Error::other("/proc/self does not show the memory of this process");
         let pages = PrivatePages::open()?;
         let (private, held) = (pages.bytes(), ProcessUsage::of(None).map(|seen| seen.held));
@@ -33,7 +33,7 @@ impl Meter {
             let base = taken.ok_or_else(unreadable)?.saturating_sub(own);
             Ok::<_, io::Error>(Share { base, most })
         };
-        pulse.set_share(share(held)?);
+        heartbeat.set_share(share(held)?);
         Ok(Self { pages, share: share(private)?, looked: None })
     }
 

@@ -21,7 +21,7 @@ use gleaner_base::Failure;
 use gleaner_lambda::Fault;
 use gleaner_lambda::signals::Curve;
 use gleaner_protocol::Layer;
-use gleaner_vitals::usage;
+use gleaner_protocol::process_stats::usage;
 use serde::{Deserialize, Serialize};
 
 use crate::api::curves::Curves;
@@ -47,20 +47,13 @@ impl fmt::Display for LambdaEngine {
 /// A lambda that can be woken.
 pub trait Guest {
     /// Runs untrusted start-up code (site packages, numpy) before `init`. Called at most once; if
-    /// it was not, the first `init` calls it.
-    ///
-    /// # Errors
-    ///
-    /// The fault that ended the start-up code.
+    /// it was not, the first `init` calls it. Returns the fault that ended the start-up code.
     fn prepare(&mut self) -> Result<(), Fault> {
         Ok(())
     }
 
     /// Runs `init`. Called once before the first wake; after a fault the guest repeats it itself.
-    ///
-    /// # Errors
-    ///
-    /// The fault that ended `init`.
+    /// Returns the fault that ended it.
     fn init(&mut self) -> Result<(), Fault>;
 
     /// Returns whether the lambda runs in this wake. A guest in another process skips a wake if the
@@ -69,7 +62,6 @@ pub trait Guest {
         true
     }
 
-    /// Runs one wake to its end.
     fn wake(&mut self, wake: Wake) -> WakeOutcome;
 
     /// Discards the instance of the lambda, as after a fault. Called if a call returned without a
@@ -80,10 +72,7 @@ pub trait Guest {
     fn engine(&self) -> LambdaEngine;
 
     /// The sandbox layers of the process that runs the lambda. Called before the first `init`.
-    ///
-    /// # Errors
-    ///
-    /// A failure if that process cannot be sandboxed.
+    /// Fails if that process cannot be sandboxed.
     fn layers(&self) -> Result<Vec<Layer>, Failure> {
         Ok(Vec::new())
     }
@@ -99,11 +88,8 @@ pub trait Guest {
     }
 
     /// Ends a lambda that runs in another process, after its last wake. Returns the totals, which
-    /// only that process has; `None` for a lambda in this process.
-    ///
-    /// # Errors
-    ///
-    /// The fault with which that process ended.
+    /// only that process has; `None` for a lambda in this process; or the fault with which that
+    /// process ended.
     fn finish(&mut self) -> Result<Option<Totals>, Fault> {
         Ok(None)
     }

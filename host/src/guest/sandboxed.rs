@@ -99,12 +99,12 @@ impl Guest for SandboxedGuest {
         self.isolation
             .close()
             .map_err(|failure| fault([failure.message, failure.causes.join(": ")].join(": ")))?;
-        let busy = self.isolation.pulse().busy(Phase::Init, PREPARE, 0);
+        let busy = self.isolation.heartbeat().busy(Phase::Init, PREPARE, 0);
         self.guest.prepare()?;
         drop(busy);
         self.isolation.bound_memory().map_err(fault)?;
         let meter =
-            self.memory.map(|memory| Meter::start(memory, self.isolation.pulse())).transpose();
+            self.memory.map(|memory| Meter::start(memory, self.isolation.heartbeat())).transpose();
         self.meter = meter
             .map_err(|error| fault(format!("cannot count the memory of the lambda: {error}")))?;
         self.is_prepared = true;
@@ -115,7 +115,7 @@ impl Guest for SandboxedGuest {
         if !self.is_prepared {
             self.prepare()?;
         }
-        let _busy = self.isolation.pulse().busy(Phase::Init, self.timeouts.init, 0);
+        let _busy = self.isolation.heartbeat().busy(Phase::Init, self.timeouts.init, 0);
         self.guest.init()?;
         match memory_fault(&mut *self.guest, &mut self.meter) {
             Some(fault) => Err(Fault { message: format!("in init: {}", fault.message), ..fault }),
@@ -126,7 +126,7 @@ impl Guest for SandboxedGuest {
     fn wake(&mut self, wake: Wake) -> WakeOutcome {
         let KillTimeouts { init, wake: timeouts } = self.timeouts;
         let timeouts = if self.needs_init { timeouts.saturating_add(init) } else { timeouts };
-        let busy = self.isolation.pulse().busy(Phase::Wake, timeouts, wake.at_ns());
+        let busy = self.isolation.heartbeat().busy(Phase::Wake, timeouts, wake.at_ns());
         let mut outcome = self.guest.wake(wake);
         if outcome.result.is_ok()
             && let Some(fault) = memory_fault(&mut *self.guest, &mut self.meter)

@@ -5,26 +5,26 @@
 //! a live run the ingress fills them in shared memory (`fed`), and this process reads them in
 //! place.
 
-mod fed;
-mod filled;
+mod owned_input;
+mod shared_input;
 
 use std::io;
 use std::sync::Arc;
 
 use gleaner_base::{Exit, Explain};
 use gleaner_buffers::{Pool, PoolError};
-use gleaner_feed::FeedError;
 use gleaner_lambda::manifest::{InputSpec, Manifest};
 use gleaner_messages::Definitions;
-use gleaner_transport::TransportError;
+use gleaner_messages::transport::TransportError;
+use gleaner_samples::FeedError;
 
 use crate::api::data::{InputRing, PerCall, Topic};
 use crate::api::frame::{Budget, Images};
 use crate::memory::Mapping;
 
-pub(crate) use fed::continue_fed_input;
-pub use fed::open_fed_inputs;
-pub use filled::open_inputs;
+pub use owned_input::open_inputs;
+pub(crate) use shared_input::continue_fed_input;
+pub use shared_input::open_fed_inputs;
 
 #[derive(Debug, thiserror::Error)]
 pub enum InputError {

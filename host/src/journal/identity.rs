@@ -54,10 +54,6 @@ pub struct LambdaIdentity<'a> {
 
 impl LambdaIdentity<'_> {
     /// Builds the header of a journal.
-    ///
-    /// # Errors
-    ///
-    /// [`IdentityError`] names the file that cannot be read.
     pub fn header(self) -> Result<JournalHeader, IdentityError> {
         let Self { manifest, build, config, remaps, engine, clock, part } = self;
         let lambda = &manifest.lambda;

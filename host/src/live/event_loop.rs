@@ -6,16 +6,16 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use gleaner_base::{Exit, Failure, nanoseconds};
-use gleaner_feed::{FeedBell, FeedError, FeedEvent, LastingFeed};
+use gleaner_messages::transport::Clock;
 use gleaner_protocol::Report;
-use gleaner_transport::Clock;
-use gleaner_vitals::Pulse;
+use gleaner_protocol::process_stats::Heartbeat;
+use gleaner_samples::{FeedError, FeedEvent, ReconnectingReader, Waker};
 
 use super::announce::Announcer;
 use super::recorder::RecorderSender;
 use super::results_writer::ResultsWriter;
 use super::round_trip::RoundTrip;
-use super::status::{Around, StatusReporter, Times};
+use super::status::{StatusContext, StatusReporter, Times};
 use crate::api::Session;
 use crate::api::data::{Topic, Wake};
 use crate::input::continue_fed_input;
@@ -38,12 +38,12 @@ pub(super) struct LiveEventLoop {
     pub(super) round_trip: Option<RoundTrip>,
     pub(super) announcer: Option<Announcer>,
     pub(super) watch: StatusReporter,
-    pub(super) feed: LastingFeed,
-    pub(super) bell: FeedBell,
+    pub(super) feed: ReconnectingReader,
+    pub(super) bell: Waker,
     /// Number of ingresses before it.
     pub(super) connections: u32,
     pub(super) clock: Clock,
-    pub(super) pulse: Pulse,
+    pub(super) heartbeat: Heartbeat,
 }
 
 impl LiveEventLoop {
@@ -64,7 +64,7 @@ impl LiveEventLoop {
                 if stop.load(Ordering::Relaxed) {
                     return Ok(());
                 }
-                self.pulse.alive(ALIVE);
+                self.heartbeat.alive(ALIVE);
                 self.results.flush();
                 self.housekeeping(now)?;
                 // There may be another bell.
@@ -136,7 +136,7 @@ impl LiveEventLoop {
             let Some(first) = topic.first_unconfirmed() else { continue };
             if let Some(announced) = self.feed.layout(id) {
                 topic.live_layout.confirm(&announced).map_err(|why| {
-                    let message = format!("input `{}` cannot be read any more", topic.name());
+                    let message = format!("input `{}` can no longer be read", topic.name());
                     let mut failure = Failure::new(Exit::Usage, message);
                     failure.causes.push(format!("topic `{}`: {why}", topic.ros_topic()));
                     failure.with_help("start it again: it then uses the definition of the writers")
@@ -178,7 +178,7 @@ impl LiveEventLoop {
         if !self.watch.is_due(now) {
             return Ok(());
         }
-        let live = self.watch.report(&Around {
+        let live = self.watch.report(&StatusContext {
             feed: &self.feed,
             inputs: &self.inputs,
             schedule: &self.schedule,

@@ -24,22 +24,21 @@ use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 
 use gleaner_base::{Exit, Failure};
-use gleaner_feed::{Feed, LastingFeed};
 use gleaner_journal::TimeRange;
 use gleaner_lambda::manifest::Manifest;
+use gleaner_messages::transport::Clock;
+use gleaner_protocol::process_stats::Heartbeat;
 use gleaner_protocol::{Layer, Report, ResultItem, WokenBy};
-use gleaner_transport::Clock;
-use gleaner_vitals::Pulse;
+use gleaner_samples::{Feed, ReconnectingReader};
 
 use self::announce::Announcer;
 use self::event_loop::LiveEventLoop;
 use self::recorder::RecorderSender;
 use self::results_writer::ResultsWriter;
 use self::round_trip::RoundTrip;
-use self::status::{Around, StatusReporter};
+use self::status::{StatusContext, StatusReporter};
 use self::topic_publisher::TopicPublisher;
 use crate::invoker::Invoker;
-use crate::journal::LambdaIdentity;
 use crate::schedule::WakeSchedule;
 use crate::session_setup::{ConfiguredLambda, Load, RunMode, SessionSetup, not_started};
 
@@ -60,7 +59,7 @@ pub struct LiveRun<'a> {
     pub recorder: Option<OwnedFd>,
     pub results: ResultsPipe,
     /// The page that shows the shim how long this thread may be busy.
-    pub pulse: Pulse,
+    pub heartbeat: Heartbeat,
     /// Drops the privileges that the process no longer needs, before the lambda is entered; returns
     /// the layers of the sandbox.
     pub close: &'a mut dyn FnMut() -> Result<Vec<Layer>, Failure>,
@@ -97,29 +96,17 @@ impl LiveRun<'_> {
         reports: impl Write + Send + 'static,
     ) -> Result<Exit, Failure> {
         let Self { lambda, manifest, settings, mut feed, starter, recorder, .. } = self;
-        let Self { results, pulse, close, stop, .. } = self;
+        let Self { results, heartbeat, close, stop, .. } = self;
         let clock = settings.clock;
         let mode = RunMode::Live(manifest.limits.deadline);
         let SessionSetup { inputs, session, mut guest } =
             SessionSetup::load_fed(&mut feed, &lambda, &manifest, mode, load)?;
-        let recorder = match recorder {
-            Some(socket) => {
-                let (build, config, remaps) = (&lambda.build, &lambda.config, &lambda.remaps);
-                let engine = guest.engine().to_string();
-                let identity = LambdaIdentity {
-                    manifest: &manifest,
-                    build,
-                    config,
-                    remaps,
-                    engine,
-                    clock: &clock.to_string(),
-                    part: TimeRange::default(),
-                };
-                let header = identity.header()?;
-                Some(RecorderSender::join(socket, header, &inputs, starter.is_some())?)
-            }
-            None => None,
-        };
+        let recorder = recorder.map(|socket| {
+            let (engine, part) = (guest.engine().to_string(), TimeRange::default());
+            let header = lambda.header(&manifest, &engine, &clock.to_string(), part)?;
+            RecorderSender::join(socket, header, &inputs, starter.is_some())
+        });
+        let recorder = recorder.transpose()?;
         let name = manifest.lambda.name.as_str();
         // In the order of the grants.
         let mut publishers = (0..).map(|index| feed.publisher(index));
@@ -156,9 +143,9 @@ impl LiveRun<'_> {
             watch,
             bell: feed.bell(),
             connections: 0,
-            feed: LastingFeed::new(feed, starter),
+            feed: ReconnectingReader::new(feed, starter),
             clock,
-            pulse,
+            heartbeat,
         };
         let ended = event_loop.run(stop);
         let faults = event_loop.watch.faults();
@@ -176,7 +163,7 @@ fn finish(mut event_loop: LiveEventLoop) -> Result<(), Failure> {
     let LiveEventLoop { results, watch, inputs, schedule, session, recorder, feed, .. } =
         event_loop;
     let dropped = recorder.map(RecorderSender::leave);
-    let last = watch.ended(&Around {
+    let last = watch.ended(&StatusContext {
         feed: &feed,
         inputs: &inputs,
         schedule: &schedule,

@@ -5,13 +5,13 @@ use std::path::PathBuf;
 
 use clap::Args;
 use gleaner_base::{Exit, Failure};
-use gleaner_feed::Feed;
-use gleaner_jail::Paths;
 use gleaner_lambda::BuildDir;
 use gleaner_lambda::manifest::Manifest;
+use gleaner_messages::transport::Clock;
 use gleaner_protocol::Handover;
-use gleaner_transport::Clock;
-use gleaner_vitals::start::stop_flag;
+use gleaner_protocol::process_stats::start::stop_flag;
+use gleaner_samples::Feed;
+use gleaner_sandbox::Paths;
 
 use super::{LiveRun, ResultsPipe, Settings};
 use crate::isolation::{Isolation, definition_dirs};
@@ -67,10 +67,6 @@ impl LiveJob {
     }
 
     /// Checks the arguments against the build and its manifest.
-    ///
-    /// # Errors
-    ///
-    /// A failure that names the manifest's line, the key or the topic, and the way out.
     pub fn new(args: RunArgs) -> Result<Self, Failure> {
         let build = BuildDir::check_fresh(&args.lambda_args.lambda)?;
         let mut manifest = Manifest::load(build.path())?;
@@ -109,7 +105,7 @@ impl LiveJob {
         let feed = Feed::connect(ingress)
             .map_err(|error| Failure::because("cannot connect to the ingress", &error))?;
         lambda.use_models(&manifest, connections.inference.take())?;
-        let pulse = isolation.pulse().clone();
+        let heartbeat = isolation.heartbeat().clone();
         let run = LiveRun {
             lambda,
             manifest,
@@ -117,8 +113,8 @@ impl LiveJob {
             feed,
             starter: Some(starter),
             recorder: connections.recorder.take(),
-            results: ResultsPipe::open(pulse.clone())?,
-            pulse,
+            results: ResultsPipe::open(heartbeat.clone())?,
+            heartbeat,
             close: &mut || isolation.close().map(<[_]>::to_vec),
             stop: &stop,
         };

@@ -94,7 +94,7 @@ impl RecorderSender {
             (self.absent, self.loses) = (None, false);
         } else if self.absent.is_some_and(|since| since.elapsed() >= KEPT) {
             if !std::mem::replace(&mut self.loses, true) {
-                tracing::warn!("no recorder: wakes and triggers are lost until there is one");
+                tracing::warn!("no recorder is connected: wakes and triggers are lost");
             }
             self.link.drop_queued();
         }

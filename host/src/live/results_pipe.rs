@@ -11,8 +11,8 @@ use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Failure};
 use gleaner_lambda::RESULT_ITEM_MAX;
+use gleaner_protocol::process_stats::{Heartbeat, inherited};
 use gleaner_protocol::{RESULTS_ENV, ResultItem};
-use gleaner_vitals::{Pulse, inherited};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::{FileType, fstat};
 
@@ -29,20 +29,17 @@ pub struct ResultsPipe {
     line: Vec<u8>,
     unwritten: u64,
     /// The page in which the shim counts what it cannot write.
-    pulse: Pulse,
+    heartbeat: Heartbeat,
 }
 
 impl ResultsPipe {
-    /// Opens the pipe that the shim has created: [`RESULTS_ENV`].
-    ///
-    /// # Errors
-    ///
-    /// A failure if this process was started without one.
-    pub fn open(pulse: Pulse) -> Result<Self, Failure> {
+    /// Opens the pipe that the shim has created: [`RESULTS_ENV`]. Fails if this process was
+    /// started without one.
+    pub fn open(heartbeat: Heartbeat) -> Result<Self, Failure> {
         let cannot =
             |error: &io::Error| Failure::caused_by(Exit::Internal, "cannot send results", error);
         let pipe = inherited(RESULTS_ENV).map_err(|error| cannot(&error))?.ok_or_else(|| {
-            Failure::new(Exit::Usage, "no process writes the results of this process").with_help(
+            Failure::new(Exit::Usage, "this process has no pipe for its results").with_help(
                 "start it with `gleaner run`, or with `gleaner-shim --results DIR -- \
                      gleaner-runtime run`",
             )
@@ -54,14 +51,14 @@ impl ResultsPipe {
                 format!("{RESULTS_ENV} names no pipe"),
             )));
         }
-        Ok(Self::over(pipe.into(), pulse))
+        Ok(Self::over(pipe.into(), heartbeat))
     }
 
-    /// A sender over `pipe`, which does not block; `pulse` has the number of items that could not
-    /// be written.
-    pub fn over(pipe: File, pulse: Pulse) -> Self {
+    /// A sender over `pipe`, which does not block; `heartbeat` has the number of items that could
+    /// not be written.
+    pub fn over(pipe: File, heartbeat: Heartbeat) -> Self {
         let waiting = VecDeque::with_capacity(WAITING);
-        Self { pipe, waiting, line: Vec::new(), unwritten: 0, pulse }
+        Self { pipe, waiting, line: Vec::new(), unwritten: 0, heartbeat }
     }
 
     /// Adds `item`, to be sent with the waiting ones. Returns whether there was room.
@@ -109,11 +106,8 @@ impl ResultsPipe {
         self.waiting.clear();
     }
 
-    /// Sends all items, and waits until `deadline` for that.
-    ///
-    /// # Errors
-    ///
-    /// A failure if an item was not accepted.
+    /// Sends all items, and waits until `deadline` for that. Fails if an item was not
+    /// accepted.
     pub(super) fn finish(&mut self, deadline: Instant) -> Result<(), Failure> {
         loop {
             self.send();
@@ -124,7 +118,7 @@ impl ResultsPipe {
             if left.is_zero() {
                 let failure = Failure::new(
                     Exit::Internal,
-                    "results are not written: their disk did not respond in time",
+                    "cannot write results: the disk did not respond in time",
                 );
                 return Err(failure.with_help("choose a folder on another disk: --out DIR"));
             }
@@ -136,7 +130,7 @@ impl ResultsPipe {
 
     /// Number of items that did not fit here, or that the shim could not write.
     pub(super) fn unwritten(&self) -> u64 {
-        self.unwritten.saturating_add(self.pulse.unwritten())
+        self.unwritten.saturating_add(self.heartbeat.unwritten())
     }
 
     /// Number of items that did not fit here.
@@ -162,7 +156,7 @@ mod tests {
     fn pages() -> (impl Read, ResultsPipe) {
         let (reader, writer) = pipe().unwrap();
         ioctl_fionbio(&writer, true).unwrap();
-        (reader, ResultsPipe::over(OwnedFd::from(writer).into(), Pulse::create().unwrap().0))
+        (reader, ResultsPipe::over(OwnedFd::from(writer).into(), Heartbeat::create().unwrap().0))
     }
 
     #[test]
@@ -203,7 +197,7 @@ mod tests {
         }
         pages.send();
         assert_eq!(pages.unwritten(), 3);
-        pages.pulse.set_unwritten(4);
+        pages.heartbeat.set_unwritten(4);
         assert_eq!((pages.unwritten(), pages.unsent()), (7, 3));
     }
 

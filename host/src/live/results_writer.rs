@@ -91,10 +91,6 @@ impl ResultsWriter {
     }
 
     /// Sends waiting items, and the last report as the summary.
-    ///
-    /// # Errors
-    ///
-    /// A failure if results do not reach the shim.
     pub(super) fn finish(self, last: Option<LiveStatus>) -> Result<(), Failure> {
         let Self { mut pages, reports, report_thread, .. } = self;
         if let Some(last) = &last {

@@ -8,7 +8,7 @@
 //! `gleaner play --stamp monotonic`.
 
 use gleaner_lambda::Decision;
-use gleaner_transport::Clock;
+use gleaner_messages::transport::Clock;
 
 use super::topic_publisher::TopicPublisher;
 use crate::api::data::Wake;

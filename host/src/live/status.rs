@@ -3,12 +3,12 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use gleaner_feed::LastingFeed;
 use gleaner_lambda::Decision;
 use gleaner_lambda::manifest::Manifest;
+use gleaner_messages::transport::Clock;
+use gleaner_protocol::process_stats::{IntervalDurations, usage};
 use gleaner_protocol::{DurationStats, LinkLosses, LiveStatus, LiveTopic};
-use gleaner_transport::Clock;
-use gleaner_vitals::{IntervalDurations, usage};
+use gleaner_samples::ReconnectingReader;
 
 use crate::api::Session;
 use crate::api::data::Topic;
@@ -31,8 +31,8 @@ pub(super) struct Times {
 }
 
 /// Other sources of a report.
-pub(super) struct Around<'a> {
-    pub(super) feed: &'a LastingFeed,
+pub(super) struct StatusContext<'a> {
+    pub(super) feed: &'a ReconnectingReader,
     pub(super) inputs: &'a [Arc<Topic>],
     pub(super) schedule: &'a WakeSchedule,
     pub(super) session: &'a Session,
@@ -107,13 +107,13 @@ impl StatusReporter {
     }
 
     /// The status since the last report.
-    pub(super) fn report(&mut self, around: &Around) -> LiveStatus {
+    pub(super) fn report(&mut self, around: &StatusContext) -> LiveStatus {
         let spreads = [self.wake_latency.take(), self.run.take(), self.decision_latency.take()];
         self.as_of_now(around, spreads)
     }
 
     /// The status of the whole run.
-    pub(super) fn ended(mut self, around: &Around) -> LiveStatus {
+    pub(super) fn ended(mut self, around: &StatusContext) -> LiveStatus {
         self.reported = self.started;
         self.before.fill(0);
         let spreads = [self.wake_latency.all(), self.run.all(), self.decision_latency.all()];
@@ -122,10 +122,11 @@ impl StatusReporter {
 
     fn as_of_now(
         &mut self,
-        around: &Around,
+        around: &StatusContext,
         [wake_latency, run, decision_latency]: [Option<DurationStats>; 3],
     ) -> LiveStatus {
-        let Around { feed, inputs, schedule, session, unwritten, unsent, recorder_link } = *around;
+        let StatusContext { feed, inputs, schedule, session, unwritten, unsent, recorder_link } =
+            *around;
         let now = self.clock.now();
         let seconds = now.saturating_sub(self.reported) as f64 / 1e9;
         self.reported = now;

@@ -2,7 +2,7 @@
 //! counted, and logged at increasing intervals.
 
 use gleaner_messages::CdrWriter;
-use gleaner_transport::Publisher;
+use gleaner_messages::transport::Publisher;
 
 pub(super) struct TopicPublisher {
     topic: String,

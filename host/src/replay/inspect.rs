@@ -8,14 +8,15 @@ use std::sync::{Arc, Mutex, PoisonError};
 use clap::Args;
 use gleaner_base::{Exit, Failure};
 use gleaner_drives::{DriveOptions, Replay, ReplayError, ReplayStep, files_of};
-use gleaner_messages::{CompressedView, ImageView, Sources};
-use gleaner_protocol::{DriveInfo, DriveTopicInfo, DurationStats, PictureInfo, Report};
-use gleaner_transport::{
+use gleaner_messages::transport::{
     Delivery, DiscoveredTopic, Gaps, Qos, SampleMeta, Sink, TopicSpec, Transport,
 };
-use gleaner_vitals::Durations;
+use gleaner_messages::{CompressedView, ImageView, Sources};
+use gleaner_protocol::process_stats::Durations;
+use gleaner_protocol::{DriveInfo, DriveTopicInfo, DurationStats, PictureInfo, Report};
 
 use super::open::{self, DriveError};
+use super::reports::send;
 use crate::isolation::definition_dirs;
 
 /// Size in bytes above which only parts of a drive are read; this much takes about a second.
@@ -45,10 +46,6 @@ pub struct InspectArgs {
 }
 
 /// Reads the drives and reports their content.
-///
-/// # Errors
-///
-/// A failure that names the drive that cannot be opened.
 pub fn inspect(args: &InspectArgs, reports: &mut dyn Write) -> Result<Exit, Failure> {
     let mut options = DriveOptions {
         sources: Some(Sources::new(&[], &definition_dirs())),
@@ -57,7 +54,7 @@ pub fn inspect(args: &InspectArgs, reports: &mut dyn Write) -> Result<Exit, Fail
     };
     let mut drive = match Replay::open_as(&args.drives, &options) {
         Err(ReplayError::Separate { drives }) if open::are_text(&drives) => {
-            super::report(reports, &Report::Separate { drives });
+            send(reports, &Report::Separate { drives });
             return Ok(Exit::Ok);
         }
         drive => drive.map_err(DriveError)?,
@@ -99,7 +96,7 @@ pub fn inspect(args: &InspectArgs, reports: &mut dyn Write) -> Result<Exit, Fail
         topics.iter_mut().for_each(|topic| topic.missing = None);
     }
     let info = DriveInfo { start_ns, end_ns, parts, out_of_order, damaged, topics, skipped };
-    super::report(reports, &Report::Drive(info));
+    send(reports, &Report::Drive(info));
     Ok(Exit::Ok)
 }
 
@@ -288,7 +285,7 @@ impl FirstMessage {
             }
             "sensor_msgs/msg/CompressedImage" => {
                 let view = CompressedView::read(cdr, meta.endian).ok()?;
-                let (header, _) = gleaner_image::probe_message(view.format, view.data).ok()?;
+                let (header, _) = gleaner_pixels::probe_message(view.format, view.data).ok()?;
                 let encoding = header.format.to_string();
                 Some(PictureInfo {
                     encoding,

@@ -12,10 +12,6 @@ use gleaner_journal::{JournalEnd, JournalEntry, JournalError, JournalHeader, Jou
 use crate::session_setup::OutputError;
 
 /// Opens the file `path` for a journal, and creates it if there is none.
-///
-/// # Errors
-///
-/// A failure that names it.
 pub(super) fn open(path: &Path) -> Result<File, Failure> {
     safe_file::write(path).map_err(|source| match UnsafePath::of(&source) {
         // A pipe would never end, a device cannot be verified later, and a link leads to a file
@@ -72,7 +68,7 @@ pub(super) fn read(path: &Path) -> Result<File, Failure> {
 }
 
 fn no_journal(path: &Path) -> Failure {
-    let message = format!("`{}` exists and is no journal", path.display());
+    let message = format!("`{}` exists and is not a journal", path.display());
     Failure::new(Exit::Usage, message).with_help("choose another name: --journal FILE")
 }
 
@@ -152,7 +148,7 @@ mod tests {
         std::os::unix::fs::symlink(&target, &link).unwrap();
         let failure = open(&link).unwrap_err();
         let text = failure.to_string();
-        assert!(text.contains("link` exists and is no journal"), "{text}");
+        assert!(text.contains("link` exists and is not a journal"), "{text}");
         assert!(text.contains("it is a link"), "{text}");
         assert_eq!(failure.exit, Exit::Usage);
         assert!(!target.exists());

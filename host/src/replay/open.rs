@@ -8,8 +8,7 @@ use gleaner_drives::{Replay, ReplayError, files_of};
 use gleaner_journal::TimeRange;
 use gleaner_messages::Sources;
 
-use super::ReplayOptions;
-use super::options::Drives;
+use super::options::{Drives, ReplayOptions};
 use crate::isolation::definition_dirs;
 
 impl Drives {

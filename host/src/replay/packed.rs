@@ -7,8 +7,9 @@ use gleaner_base::{Exit, Failure};
 use gleaner_drives as replay;
 use gleaner_drives::{ContentName, Unpacked, unpack};
 
+use super::job::ReplayJob;
 use super::open::DriveError;
-use super::{ReplayJob, ReplayOptions};
+use super::options::ReplayOptions;
 
 /// Option of a worker with two values: a packed file, and the path of its unpacked content.
 const UNPACKED: &str = "--unpacked";
@@ -80,10 +81,6 @@ impl ReplayJob {
 impl Packed {
     /// Unpacks the packed files for a worker. This process has unpacked them already, but into
     /// files whose names are removed and cannot be restored: a worker cannot open those.
-    ///
-    /// # Errors
-    ///
-    /// A failure with the file that cannot be unpacked.
     pub fn unpack_for_worker(&self) -> Result<WorkerContents, Failure> {
         let (mut arguments, mut names) = (Vec::new(), Vec::new());
         for unpacked in unpack(&self.named, &self.options).map_err(DriveError)? {

@@ -8,8 +8,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 use gleaner_base::safe_file;
 use gleaner_lambda::signals::{Signals, TriggerPicture};
 use gleaner_lambda::{Decision, Trigger};
+use gleaner_messages::transport::SampleMeta;
 use gleaner_recorder::{ObjectBox, is_image, thumbnail_with_boxes};
-use gleaner_transport::SampleMeta;
 
 use crate::api::data::Topic;
 use crate::session_setup::OutputError;
@@ -195,7 +195,7 @@ fn remove(folder: &Path) -> Result<(), OutputError> {
 
 #[cfg(test)]
 mod tests {
-    use gleaner_transport::Guid;
+    use gleaner_messages::transport::Guid;
 
     use super::*;
     use crate::test_decision::triggered;

@@ -9,16 +9,19 @@ use gleaner_drives::Replay;
 use gleaner_journal::{JournalEntry, JournalHeader};
 use gleaner_lambda::Clip;
 use gleaner_lambda::manifest::{Manifest, RecordSpec};
+use gleaner_messages::transport::{
+    Delivery, DiscoveredTopic, SampleMeta, Sink, Transport, same_type,
+};
 use gleaner_recorder::{
     EarlierClips, LambdaId, LambdaSpec, RecordError, Recorder, RecordingFolder, Settings, TopicId,
     TopicSchema, is_image, lambda_digest,
 };
-use gleaner_transport::{Delivery, DiscoveredTopic, SampleMeta, Sink, Transport, same_type};
 
+use super::options::ReplayOptions;
 use super::pictures::RecordedCamera;
 use super::topic_filter;
-use super::{CLOCK, ReplayOptions};
 use crate::input::Remap;
+use crate::journal::CLOCK_OF_DRIVE;
 
 /// Most sentences on what all clips lack.
 const NOTES_MAX: usize = 64;
@@ -102,15 +105,7 @@ impl ReplayRecorder {
         drive: &mut Replay,
     ) -> Result<Option<Self>, Failure> {
         let Some(rules) = &manifest.record else {
-            if options.topics.is_empty() {
-                return Ok(None);
-            }
-            let failure = Failure::new(
-                Exit::Usage,
-                "--topics selects the topics of clips, and this lambda records none",
-            );
-            return Err(failure
-                .with_help("add a table [record] to lambda.toml, which sets the length of clips"));
+            return if options.topics.is_empty() { Ok(None) } else { Err(nothing_recorded()) };
         };
         let shared = Arc::new(Mutex::new(SharedRecorder { recorder: None, failed: None }));
         let known = drive.topics();
@@ -122,22 +117,12 @@ impl ReplayRecorder {
         for name in &chosen.names {
             let name = name.as_str();
             let found = recorded_type(name, &known, manifest, options);
-            let others = known.iter().filter(|topic| topic.topic == name);
-            let is_other = |topic: &&DiscoveredTopic| {
-                found.is_some_and(|found| found.type_name != topic.type_name)
-            };
-            let others = others.filter(is_other);
-            notes.extend(others.filter(|topic| topic.messages != Some(0)).take(NOTED).map(
-                |topic| {
-                    let (name, type_name) = (excerpt(name), excerpt(&topic.type_name));
-                    format!("no messages of {name} that have the type {type_name}")
-                },
-            ));
-            if found.is_none() {
-                tracing::warn!(
+            match found {
+                Some(found) => notes.extend(other_types(found, &known)),
+                None => tracing::warn!(
                     topic = %name,
-                    "the drive has no such topic of [record]: clips are made without it"
-                );
+                    "the drive does not have a topic of [record]: clips lack this topic"
+                ),
             }
             let camera = found.filter(|found| !is_seen && is_image(&found.type_name));
             is_seen |= camera.is_some();
@@ -151,33 +136,15 @@ impl ReplayRecorder {
             if let Some(found) = found
                 && let Err(error) = drive.subscribe(&topic_filter::spec_of(found), recorded.clone())
             {
-                let failure = Failure::caused_by(
-                    Exit::Usage,
-                    format!("cannot record topic `{name}`"),
-                    &error,
-                );
-                return Err(failure.with_help(
+                let message = format!("cannot record topic `{name}`");
+                return Err(Failure::caused_by(Exit::Usage, message, &error).with_help(
                     "remove the topic from [record], or replay without clips: --no-record",
                 ));
             }
             topics.push(recorded);
         }
         if !topics.iter().any(|recorded| recorded.exists) {
-            let mut failure =
-                Failure::new(Exit::Usage, "the drive has none of the topics of [record]");
-            let list = |names: Vec<&str>| names.join("`, `");
-            failure.causes = vec![format!(
-                "[record] has `{}`",
-                list(topics.iter().map(|recorded| recorded.topic.name.as_str()).collect())
-            )];
-            let help = match known.is_empty() {
-                true => "the drive has no messages; copy it again if it is damaged".to_owned(),
-                false => format!(
-                    "the drive has {}; pass --remap FROM:=TO, or replay without clips: --no-record",
-                    topic_filter::list(&known)
-                ),
-            };
-            return Err(failure.with_help(help));
+            return Err(none_found(&topics, &known));
         }
         let rules = rules.clone();
         Ok(Some(Self { shared, topics, rules, notes, earlier: None, lambda: None }))
@@ -203,7 +170,7 @@ impl ReplayRecorder {
             preroll_bytes: self.rules.preroll_size.bytes(),
             max_length: self.rules.max_length,
             folder: out.to_owned(),
-            clock: CLOCK.to_owned(),
+            clock: CLOCK_OF_DRIVE.to_owned(),
             prefault: false,
         };
         let mut recorder = Recorder::new(folder, settings)?;
@@ -269,6 +236,43 @@ impl ReplayRecorder {
             None => Ok(T::default()),
         }
     }
+}
+
+/// The failure of `--topics` for a lambda that records no clips.
+fn nothing_recorded() -> Failure {
+    let message = "--topics selects the topics of clips, and this lambda records none";
+    Failure::new(Exit::Usage, message)
+        .with_help("add a table [record] to lambda.toml, which sets the length of clips")
+}
+
+/// The failure of a drive without any topic of `[record]`.
+fn none_found(topics: &[Arc<TopicRecorder>], known: &[DiscoveredTopic]) -> Failure {
+    let mut failure = Failure::new(Exit::Usage, "the drive has none of the topics of [record]");
+    let names: Vec<_> = topics.iter().map(|recorded| recorded.topic.name.as_str()).collect();
+    failure.causes = vec![format!("[record] has `{}`", names.join("`, `"))];
+    failure.with_help(match known.is_empty() {
+        true => "the drive has no messages; copy it again if it is damaged".to_owned(),
+        false => format!(
+            "the drive has {}; pass --remap FROM:=TO, or replay without clips: --no-record",
+            topic_filter::list(known)
+        ),
+    })
+}
+
+/// Notes on the types of a topic that are left out, beside the one that is recorded.
+fn other_types<'t>(
+    recorded: &'t DiscoveredTopic,
+    known: &'t [DiscoveredTopic],
+) -> impl Iterator<Item = String> + 't {
+    let is_other = |topic: &&DiscoveredTopic| {
+        topic.topic == recorded.topic
+            && topic.type_name != recorded.type_name
+            && topic.messages != Some(0)
+    };
+    known.iter().filter(is_other).take(NOTED).map(|topic| {
+        let (name, type_name) = (excerpt(&topic.topic), excerpt(&topic.type_name));
+        format!("no messages of {name} that have the type {type_name}")
+    })
 }
 
 /// Chooses the type in which a topic of the drive is recorded: that in which the lambda reads it,

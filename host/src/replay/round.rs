@@ -7,47 +7,57 @@ use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Explain, Failure};
 use gleaner_drives::{Progress, Replay, ReplayError, ReplayStep};
-use gleaner_journal::{JournalEnd, JournalHeader, TimeRange};
+use gleaner_journal::{JournalEnd, TimeRange};
 use gleaner_lambda::FaultKind;
 use gleaner_lambda::manifest::Manifest;
-use gleaner_protocol::{RecordingCounts, ReplaySummary, Report, Round, TopicReport, WokenBy};
-use gleaner_vitals::usage;
+use gleaner_protocol::{RecordingCounts, ReplaySummary, Report, TopicReport, WokenBy};
 
 use super::digests::Digests;
 use super::drive_loop::{self, DriveHandler, DriveSpan, LoopEnd};
 use super::journal_file::JournalFile;
 use super::open::{self, DriveError};
-use super::options::Results;
+use super::options::ReplayOptions;
 use super::record::{ReplayRecorder, remove_clips};
+use super::reports::send;
 use super::signals::SignalCollector;
-use super::{CLOCK, ReplayOptions, report as send};
 use crate::api::Session;
 use crate::api::data::{Counts, Topic, Wake};
 use crate::api::log::LogLine;
 use crate::api::trace::offered;
 use crate::guest::{LambdaEngine, Totals};
 use crate::invoker::Invoker;
-use crate::journal::{EntryBuilder, IdentityError, LambdaIdentity};
+use crate::journal::{CLOCK_OF_DRIVE, EntryBuilder};
 use crate::schedule::WakeSchedule;
-use crate::session_setup::{
-    ConfiguredLambda, Load, Output, OutputError, RunMode, SessionSetup, not_started,
-};
+use crate::session_setup::{Load, Output, OutputError, RunMode, SessionSetup, not_started};
 
 /// Interval of progress reports; a shorter one is not visible to a user.
 const PROGRESS: Duration = Duration::from_millis(100);
 const SAMPLES_PER_CLOCK_READ: u64 = 256;
 
+pub(super) struct Results {
+    pub(super) out: PathBuf,
+    /// Set if every decision is written.
+    pub(super) all: bool,
+    /// Set if clips are written.
+    pub(super) record: bool,
+    pub(super) journal: Option<PathBuf>,
+    pub(super) repeat: u32,
+}
+
 struct ReplayLoop<'a> {
     invoker: Invoker,
     schedule: WakeSchedule,
     session: Session,
-    output: &'a mut Output,
+    output: Output,
     reports: &'a mut dyn Write,
     /// Builds the entries of the journal and the clips; `None` if there is neither.
     entry_builder: Option<EntryBuilder>,
     journal: Option<JournalFile>,
+    /// Checksums of the drives, for the end of the journal.
+    digests: Option<Digests>,
     recording: Option<ReplayRecorder>,
     signals: SignalCollector,
+    engine: LambdaEngine,
     part: TimeRange,
     /// Number of clips of an earlier replay that were removed.
     clips_replaced: u64,
@@ -164,13 +174,49 @@ impl ReplayLoop<'_> {
     }
 
     /// Ends the journal, if there is one, with the checksums of the drives.
-    fn finish_journal(&mut self, digests: Option<Digests>, is_whole: bool) -> Result<(), Failure> {
-        let (Some(journal), Some(digests)) = (self.journal.take(), digests) else { return Ok(()) };
+    fn finish_journal(&mut self, is_whole: bool) -> Result<(), Failure> {
+        let ended = self.journal.take().zip(self.digests.take());
+        let Some((journal, digests)) = ended else { return Ok(()) };
         let samples = self.session.inputs().iter().map(|topic| offered(topic)).collect();
         let end = JournalEnd { wakes: self.wakes, samples, drives: digests.take()? };
         // A journal of a damaged drive, or of a lambda that was killed, gets no end, which would
         // claim to be complete.
         Ok(journal.finish((is_whole && self.stopped.is_none()).then_some(&end))?)
+    }
+
+    /// Runs the lambda over the drive, and writes the results into `out`.
+    fn complete(
+        mut self,
+        mut drive: Replay,
+        options: &ReplayOptions,
+        out: &Path,
+        manifest: &Manifest,
+    ) -> Result<ReplayOutcome, Failure> {
+        let started = Instant::now();
+        let ran = self.run(&mut drive);
+        // Decisions up to an error are kept.
+        let flushed = self.flush();
+        let (reached, recorded) = ran?;
+        flushed?;
+        let broken = reached.broken.map(DriveError);
+        let totals = self.finish(reached.at_ns, manifest)?;
+        self.finish_journal(broken.is_none())?;
+        let inputs = self.session.inputs();
+        let totals = totals.unwrap_or_else(|| Totals::of(&inputs, self.signals.curves()));
+        let end = ReplayEnd {
+            drive: &drive,
+            at_ns: reached.at_ns,
+            broken: broken.as_ref(),
+            recorded,
+            totals: &totals,
+            wall_s: started.elapsed().as_secs_f64(),
+        };
+        let summary = self.summary(options, out, manifest, end);
+        let Self { signals, output, .. } = self;
+        // Only the HTML report needs these. The other results are complete without them.
+        let incomplete = signals.write(out, &output, &options.lambda.config, totals).err();
+        output.finish(&summary)?;
+        Ok(ReplayOutcome { summary, broken: broken.map(|error| error.exit()), incomplete })
     }
 
     fn summary(
@@ -180,7 +226,7 @@ impl ReplayLoop<'_> {
         manifest: &Manifest,
         end: ReplayEnd<'_>,
     ) -> ReplaySummary {
-        let ReplayEnd { drive, at_ns, broken, recorded, totals, models, wall_s } = end;
+        let ReplayEnd { drive, at_ns, broken, recorded, totals, wall_s } = end;
         let start_ns = drive.start_ns().unwrap_or(0);
         ReplaySummary {
             lambda: manifest.lambda.name.to_string(),
@@ -212,7 +258,7 @@ impl ReplayLoop<'_> {
             peak_rss_bytes: self.invoker.peak_resident_bytes(),
             topics: self.session.inputs().iter().zip(&totals.counts).map(topic_report).collect(),
             recording: recorded,
-            models,
+            models: self.engine.models.clone(),
             clips_replaced: self.clips_replaced,
             damaged: broken.map(|error| {
                 let mut failure = Failure::because("the drive could not be read in full", error);
@@ -234,8 +280,6 @@ struct ReplayEnd<'a> {
     broken: Option<&'a DriveError>,
     recorded: RecordingCounts,
     totals: &'a Totals,
-    /// The runtime of each model.
-    models: Vec<String>,
     wall_s: f64,
 }
 
@@ -256,19 +300,17 @@ pub(super) fn replay(
     reports: &mut dyn Write,
     is_first: bool,
 ) -> Result<ReplayOutcome, Failure> {
-    let name = manifest.lambda.name.as_str();
     let part = open::restrict(&mut drive, options)?;
-    let mut recording = if results.record {
-        ReplayRecorder::subscribe(manifest, options, &mut drive)?
-    } else {
-        None
+    let mut recording = match results.record {
+        true => ReplayRecorder::subscribe(manifest, options, &mut drive)?,
+        false => None,
     };
     let SessionSetup { inputs, session, mut guest } =
         SessionSetup::load(&mut drive, &options.lambda, manifest, RunMode::Replay, load)?;
     let engine = guest.engine();
-    let has_header = results.journal.is_some() || recording.is_some();
-    let header =
-        has_header.then(|| journal_header(&options.lambda, manifest, &engine, part)).transpose()?;
+    let header = (results.journal.is_some() || recording.is_some())
+        .then(|| options.lambda.header(manifest, &engine.to_string(), CLOCK_OF_DRIVE, part));
+    let header = header.transpose()?;
     // Its preroll is allocated before `init`, from which on memory counts as the lambda's.
     if let (Some(recording), Some(header)) = (&mut recording, &header) {
         recording.start(&results.out, header)?;
@@ -284,11 +326,11 @@ pub(super) fn replay(
     let initialised = guest.init();
     // The log of `init` belongs to no wake.
     let (init_log, _) = session.take_log();
-    initialised.map_err(|fault| not_started(name, fault, &init_log))?;
+    initialised.map_err(|fault| not_started(manifest.lambda.name.as_str(), fault, &init_log))?;
     // The results of an earlier replay are removed only now: a failed start must not touch them.
     let journal = results.journal.as_deref().zip(header.as_ref());
     let journal = journal.map(|(path, header)| JournalFile::create(path, header)).transpose()?;
-    let mut output = Output::create(&results.out, results.all)?;
+    let output = Output::create(&results.out, results.all)?;
     let clips_replaced = match &mut recording {
         Some(recording) => recording.replace()?,
         None => remove_clips(&results.out)?,
@@ -297,12 +339,14 @@ pub(super) fn replay(
         schedule: WakeSchedule::new(manifest, &inputs),
         invoker: Invoker::new(session.clone(), guest),
         session,
-        output: &mut output,
+        output,
         reports,
         entry_builder: header.is_some().then(|| EntryBuilder::new(&inputs)),
         journal,
+        digests,
         recording,
         signals,
+        engine,
         part,
         clips_replaced,
         wakes: 0,
@@ -314,46 +358,7 @@ pub(super) fn replay(
         progress_sent: Instant::now(),
     };
     replay_loop.write_log(&init_log)?;
-
-    let started = Instant::now();
-    let ran = replay_loop.run(&mut drive);
-    // Decisions up to an error are kept.
-    let flushed = replay_loop.flush();
-    let (reached, recorded) = ran?;
-    flushed?;
-    let broken = reached.broken.map(DriveError);
-    let totals = replay_loop.finish(reached.at_ns, manifest)?;
-    replay_loop.finish_journal(digests, broken.is_none())?;
-    let totals = totals.unwrap_or_else(|| Totals::of(&inputs, replay_loop.signals.curves()));
-    let end = ReplayEnd {
-        drive: &drive,
-        at_ns: reached.at_ns,
-        broken: broken.as_ref(),
-        recorded,
-        totals: &totals,
-        models: engine.models,
-        wall_s: started.elapsed().as_secs_f64(),
-    };
-    let summary = replay_loop.summary(options, &results.out, manifest, end);
-    // Only the HTML report needs these. The other results are complete without them.
-    let incomplete = replay_loop
-        .signals
-        .write(&results.out, replay_loop.output, &options.lambda.config, totals)
-        .err();
-    output.finish(&summary)?;
-    Ok(ReplayOutcome { summary, broken: broken.map(|error| error.exit()), incomplete })
-}
-
-/// Describes the lambda, for the journal and for clips.
-fn journal_header(
-    lambda: &ConfiguredLambda,
-    manifest: &Manifest,
-    engine: &LambdaEngine,
-    part: TimeRange,
-) -> Result<JournalHeader, IdentityError> {
-    let ConfiguredLambda { build, config, remaps, .. } = lambda;
-    let engine = engine.to_string();
-    LambdaIdentity { manifest, build, config, remaps, engine, clock: CLOCK, part }.header()
+    replay_loop.complete(drive, options, &results.out, manifest)
 }
 
 /// Describes the part of a damaged drive that was read.
@@ -369,17 +374,6 @@ fn read_so_far(drive: &Replay, at_ns: i64) -> String {
             format!("read: {done} messages, up to {seconds:.3} s; later messages are lost")
         }
         _ => "read: no message of the inputs".to_owned(),
-    }
-}
-
-pub(super) fn report(n: u32, summary: &ReplaySummary) -> Round {
-    Round {
-        n,
-        wakes: summary.wakes,
-        faults: summary.faults,
-        wall_s: summary.wall_s,
-        wakes_per_s: summary.wakes_per_s,
-        rss_bytes: usage::resident(),
     }
 }
 

@@ -12,7 +12,7 @@ use hdrhistogram::Histogram;
 
 use super::pictures::{RecordedCamera, TriggerPictures};
 use crate::api::curves::Curves;
-use crate::api::data::Topic;
+use crate::api::data::{Topic, record_curves};
 use crate::guest::Totals;
 use crate::session_setup::{Output, OutputError};
 
@@ -34,7 +34,7 @@ impl SignalCollector {
     pub(super) fn of(inputs: &[Arc<Topic>], camera: Option<Arc<RecordedCamera>>) -> Self {
         let empty = || Histogram::new_with_max(MOST, 3).expect("three digits are valid");
         let pictures = TriggerPictures::new(inputs, camera);
-        Self { curves: Curves::of(inputs), run: empty(), fuel: empty(), pictures }
+        Self { curves: record_curves(inputs), run: empty(), fuel: empty(), pictures }
     }
 
     pub(super) fn wake(&mut self, decision: &Decision) {

@@ -6,10 +6,10 @@ use std::collections::HashSet;
 use gleaner_base::{Exit, Failure, excerpt};
 use gleaner_drives::Replay;
 use gleaner_lambda::manifest::RecordSpec;
+use gleaner_messages::transport::{DiscoveredTopic, Qos, TopicSpec};
 use gleaner_recorder::{MESSAGE_MAX, TOPICS_MAX};
-use gleaner_transport::{DiscoveredTopic, Qos, TopicSpec};
 
-use super::ReplayOptions;
+use super::options::ReplayOptions;
 use crate::input::Remap;
 
 /// Maximum number of topics that a message names.

@@ -4,13 +4,12 @@ use gleaner_base::Failure;
 use gleaner_drives::{Replay, ReplayStep};
 use gleaner_lambda::manifest::Manifest;
 
-use super::ReplayOptions;
 use super::drive_loop::{self, DriveHandler, DriveSpan};
 use super::open::open_drives;
+use super::options::ReplayOptions;
 use super::record::ReplayRecorder;
 use crate::api::Session;
-use crate::api::curves::Curves;
-use crate::api::data::Wake;
+use crate::api::data::{Wake, record_curves};
 use crate::guest::Totals;
 use crate::guest::worker::MessageSender;
 use crate::invoker::Invoker;
@@ -33,7 +32,7 @@ pub(super) fn run(
         if is_recorded { ReplayRecorder::subscribe(manifest, options, &mut drive)? } else { None };
     let SessionSetup { inputs, session, mut guest } =
         SessionSetup::load(&mut drive, &options.lambda, manifest, RunMode::Replay, load)?;
-    let curves = Curves::of(&inputs);
+    let curves = record_curves(&inputs);
     if guest.init().is_err() {
         // The guest has sent the fault.
         return Ok(());

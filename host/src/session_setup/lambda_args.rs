@@ -6,13 +6,15 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use gleaner_base::{ByteSize, Exit, Failure, PlainFile};
+use gleaner_journal::{JournalHeader, TimeRange};
 use gleaner_lambda::manifest::{ConfigSet, ConfigValue, Manifest, ModelSpec, Tightened};
 use gleaner_lambda::{BuildDir, Vehicle};
+use gleaner_pixels::vision::DetectorLayout;
 use gleaner_protocol::{Handover, PASSES_INFERENCE};
-use gleaner_vision::DetectorLayout;
 
 use crate::api::models::{ModelEntry, Models};
 use crate::input::Remap;
+use crate::journal::{IdentityError, LambdaIdentity};
 
 /// Longest file of labels; one of a thousand classes has some 10 kB.
 const LABELS_MAX: ByteSize = ByteSize::mib(1);
@@ -36,7 +38,6 @@ pub struct LambdaArgs {
     pub starter_passes_inference: bool,
 }
 
-/// A lambda with its settings, checked.
 pub struct ConfiguredLambda {
     pub folder: PathBuf,
     /// Its build, which is not older than its sources.
@@ -55,10 +56,6 @@ pub struct ConfiguredLambda {
 impl ConfiguredLambda {
     /// Checks the overrides against the manifest, and applies the limits of the vehicle to
     /// `manifest`.
-    ///
-    /// # Errors
-    ///
-    /// A failure that names the key or the topic, and the way out.
     pub fn new(
         args: LambdaArgs,
         build: BuildDir,
@@ -73,6 +70,18 @@ impl ConfiguredLambda {
         known_topics(&remaps, manifest)?;
         let models = Models::default();
         Ok(Self { folder: lambda, build, config, remaps, vehicle, models, passes_inference })
+    }
+
+    /// Describes the lambda in an engine of this name, for a journal of `part` by `clock`.
+    pub(crate) fn header(
+        &self,
+        manifest: &Manifest,
+        engine: &str,
+        clock: &str,
+        part: TimeRange,
+    ) -> Result<JournalHeader, IdentityError> {
+        let (Self { build, config, remaps, .. }, engine) = (self, engine.to_owned());
+        LambdaIdentity { manifest, build, config, remaps, engine, clock, part }.header()
     }
 
     /// Opens its models over the connection that the starter passes on standard input, if it does.
@@ -90,11 +99,7 @@ impl ConfiguredLambda {
         self.use_models(manifest, socket)
     }
 
-    /// Opens its models over `socket`, if there is one.
-    ///
-    /// # Errors
-    ///
-    /// A failure if labels cannot be read.
+    /// Opens its models over `socket`, if there is one. Fails if labels cannot be read.
     pub fn use_models(
         &mut self,
         manifest: &Manifest,
@@ -156,7 +161,7 @@ fn model_entry(model: &ModelSpec, build: &BuildDir) -> Result<ModelEntry, Failur
 /// its standard input.
 pub(crate) fn take_stdin() -> Result<OwnedFd, Failure> {
     let failed = |error: io::Error| {
-        Failure::caused_by(Exit::Internal, "cannot take the socket of the starter", &error)
+        Failure::caused_by(Exit::Internal, "cannot take the socket of the parent process", &error)
     };
     let socket =
         rustix::io::fcntl_dupfd_cloexec(io::stdin(), 3).map_err(io::Error::from).map_err(failed)?;

@@ -7,11 +7,11 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use gleaner_base::{Exit, Failure, visible};
-use gleaner_feed::Feed;
 use gleaner_lambda::Fault;
 use gleaner_lambda::manifest::Manifest;
 use gleaner_messages::Sources;
-use gleaner_transport::Transport;
+use gleaner_messages::transport::Transport;
+use gleaner_samples::Feed;
 
 pub use gleaner_lambda::{Output, OutputError, RESULTS};
 pub(crate) use lambda_args::take_stdin;
@@ -52,10 +52,6 @@ pub struct SessionSetup {
 
 impl SessionSetup {
     /// Opens the inputs in rings that `transport` fills, and loads the lambda.
-    ///
-    /// # Errors
-    ///
-    /// A failure that explains why the lambda cannot start.
     pub fn load(
         transport: &mut dyn Transport,
         lambda: &ConfiguredLambda,
@@ -68,10 +64,6 @@ impl SessionSetup {
     }
 
     /// Attaches the inputs in the memory of the ingress, and loads the lambda.
-    ///
-    /// # Errors
-    ///
-    /// A failure that explains why the lambda cannot start.
     pub fn load_fed(
         feed: &mut Feed,
         lambda: &ConfiguredLambda,

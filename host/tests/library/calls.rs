@@ -13,11 +13,11 @@ use gleaner_host::api::inference::{InferenceError, Model};
 use gleaner_host::api::log::Level;
 use gleaner_host::input::open_inputs;
 use gleaner_lambda::manifest::{Limits, Manifest};
-use gleaner_operations::{Deadline, Operation};
+use gleaner_messages::transport::loopback::Loopback;
+use gleaner_pixels::vision::{Placement, Preprocess};
 use gleaner_protocol::inference::Element;
+use gleaner_test_support::operations::{Deadline, Operation};
 use gleaner_tests::drive::{COMPRESSED, IMAGE, compressed, image};
-use gleaner_transport::loopback::Loopback;
-use gleaner_vision::{Placement, Preprocess};
 
 const WIDTH: u32 = 701;
 const HEIGHT: u32 = 900;

@@ -8,8 +8,8 @@ use gleaner_base::ByteSize;
 use gleaner_host::guest::Guest;
 use gleaner_lambda::FaultKind;
 use gleaner_lambda::manifest::Limits;
+use gleaner_protocol::process_stats::usage;
 use gleaner_tests::times;
-use gleaner_vitals::usage;
 
 /// Growth in bytes that is allowed to the allocator and the kernel, over any number of faults.
 const SLACK_BYTES: u64 = 4 << 20;

@@ -4,16 +4,16 @@ use std::fmt::Write;
 use std::sync::Arc;
 use std::thread::JoinHandle;
 
-use gleaner_feed::Feed;
 use gleaner_host::api::data::Topic;
 use gleaner_host::input::open_fed_inputs;
 use gleaner_ingress::Ingress;
 use gleaner_lambda::manifest::Manifest;
 use gleaner_messages::Sources;
+use gleaner_messages::transport::loopback::Loopback;
+use gleaner_messages::transport::{Guid, SampleMeta};
 use gleaner_protocol::ingress::{AddReader, IngressControl, TopicGrant};
+use gleaner_samples::Feed;
 use gleaner_tests::TempFolder;
-use gleaner_transport::loopback::Loopback;
-use gleaner_transport::{Guid, SampleMeta};
 
 use crate::live::{Announced, WrittenLoopback};
 use crate::live_layouts::LAYOUT;

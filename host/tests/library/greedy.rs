@@ -13,7 +13,7 @@ use gleaner_host::guest::{Guest, WakeOutcome};
 use gleaner_host::input::open_inputs;
 use gleaner_lambda::Fault;
 use gleaner_lambda::manifest::{ConfigValue, Limits, Manifest};
-use gleaner_transport::loopback::Loopback;
+use gleaner_messages::transport::loopback::Loopback;
 
 use gleaner_tests::drive::{IMAGE, image};
 use gleaner_tests::{TempFolder, root};

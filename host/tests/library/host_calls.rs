@@ -16,12 +16,12 @@ use gleaner_host::input::open_inputs;
 use gleaner_lambda::manifest::{Limits, Manifest};
 use gleaner_lambda::{Fault, Trigger};
 use gleaner_messages::Endian;
-use gleaner_operations::{DriverStep, MESSAGE, Operation, setup};
+use gleaner_messages::transport::SampleMeta;
+use gleaner_messages::transport::loopback::Loopback;
+use gleaner_protocol::process_stats::usage;
+use gleaner_test_support::operations::{DriverStep, MESSAGE, Operation, setup};
 use gleaner_tests::drive::{COMPRESSED, CdrBuilder, IMAGE, compressed, image};
 use gleaner_tests::{root, times};
-use gleaner_transport::SampleMeta;
-use gleaner_transport::loopback::Loopback;
-use gleaner_vitals::usage;
 
 use crate::meta;
 use crate::own_process::ran_elsewhere;

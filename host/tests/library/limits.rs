@@ -8,8 +8,8 @@ use gleaner_host::api::data::{DataError, PATH_BYTES, SAMPLES_PER_CALL, TEXTS_PER
 use gleaner_host::guest::Guest;
 use gleaner_lambda::FaultKind;
 use gleaner_lambda::manifest::{Limits, Manifest};
+use gleaner_protocol::process_stats::usage;
 use gleaner_tests::drive::{COMPRESSED, CdrBuilder, IMAGE, image};
-use gleaner_vitals::usage;
 
 /// Maximum result of one call.
 const BYTES_PER_CALL: usize = Limits::MAX.call_bytes.bytes() as usize;
@@ -346,7 +346,7 @@ fn depth_keeps_its_16_bits_from_the_message_to_the_frame() {
         ("16UC1; compressedDepth png", &after),
     ] {
         let frame = frame(format, data).unwrap();
-        assert_eq!(frame.info().encoding, gleaner_image::Encoding::Mono16, "{format}");
+        assert_eq!(frame.info().encoding, gleaner_pixels::Encoding::Mono16, "{format}");
         assert_eq!(frame.bytes(), values, "{format}");
         let error = frame.resize(2, 1).err().unwrap().to_string();
         assert!(error.contains("resize of mono16 would keep 8 of its 16 bits"), "{error}");

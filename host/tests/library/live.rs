@@ -12,7 +12,6 @@ use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use gleaner_base::{Exit, Failure};
-use gleaner_feed::Feed;
 use gleaner_host::api::Session;
 use gleaner_host::api::data::{Sample, Wake};
 use gleaner_host::guest::{Guest, LambdaEngine, WakeOutcome};
@@ -22,17 +21,18 @@ use gleaner_ingress::Ingress;
 use gleaner_lambda::manifest::Manifest;
 use gleaner_lambda::{Fault, FaultKind};
 use gleaner_messages::Definitions;
-use gleaner_protocol::ingress::{
-    AddReader, IngressControl, PublishGrant, ReceptionStatus, TopicGrant,
-};
-use gleaner_protocol::{Handover, LiveStatus, Report, ResultItem};
-use gleaner_tests::TempFolder;
-use gleaner_transport::loopback::Loopback;
-use gleaner_transport::{
+use gleaner_messages::transport::loopback::Loopback;
+use gleaner_messages::transport::{
     Clock, Delivery, DiscoveredTopic, Guid, Health, LiveSource, PublishError, Publisher, Qos,
     SampleMeta, Sink, Subscription, TopicSpec, Transport, TransportError,
 };
-use gleaner_vitals::Pulse;
+use gleaner_protocol::ingress::{
+    AddReader, IngressControl, PublishGrant, ReceptionStatus, TopicGrant,
+};
+use gleaner_protocol::process_stats::Heartbeat;
+use gleaner_protocol::{Handover, LiveStatus, Report, ResultItem};
+use gleaner_samples::Feed;
+use gleaner_tests::TempFolder;
 
 use crate::recorded_run::{configured, until};
 
@@ -204,7 +204,7 @@ impl Running {
         let (stopped, announce) = (Arc::clone(&stop), announce.map(str::to_owned));
         let folder = lambda.path().to_owned();
         let run = thread::spawn(move || {
-            let pulse = Pulse::create().unwrap().0;
+            let heartbeat = Heartbeat::create().unwrap().0;
             let run = LiveRun {
                 lambda: configured(&folder),
                 manifest,
@@ -219,8 +219,11 @@ impl Running {
                 feed: Feed::connect(socket).unwrap(),
                 starter: Some(starter.into()),
                 recorder,
-                results: ResultsPipe::over(File::from(OwnedFd::from(to_results)), pulse.clone()),
-                pulse,
+                results: ResultsPipe::over(
+                    File::from(OwnedFd::from(to_results)),
+                    heartbeat.clone(),
+                ),
+                heartbeat,
                 close: &mut || Ok(Vec::new()),
                 stop: &stopped,
             };

@@ -29,6 +29,6 @@ fn samples_of_an_announced_layout_wait_until_it_is_known_to_be_that_of_the_defin
     *running.announced.lock().unwrap() = Some(other.clone());
     running.publish_in(1, 5);
     let failure = running.ended().unwrap_err().to_string();
-    assert!(failure.contains("input `numbers` cannot be read any more"), "{failure}");
+    assert!(failure.contains("input `numbers` can no longer be read"), "{failure}");
     assert!(failure.contains(LAYOUT) && failure.contains(&other), "{failure}");
 }

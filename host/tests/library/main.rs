@@ -18,7 +18,7 @@ mod schedule;
 mod small_limits;
 mod unrecorded;
 
-use gleaner_transport::{Guid, SampleMeta};
+use gleaner_messages::transport::{Guid, SampleMeta};
 
 /// Returns the metadata of a little-endian sample, which was published when it was received.
 fn meta(at_ns: i64, seq: u64) -> SampleMeta {

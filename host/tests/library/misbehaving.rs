@@ -13,8 +13,8 @@ use gleaner_host::guest::{Guest, WakeOutcome};
 use gleaner_host::input::open_inputs;
 use gleaner_lambda::FaultKind;
 use gleaner_lambda::manifest::{ConfigValue, Limits, Manifest};
+use gleaner_messages::transport::loopback::Loopback;
 use gleaner_tests::{root, with_header};
-use gleaner_transport::loopback::Loopback;
 
 use crate::meta;
 

@@ -12,7 +12,6 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Failure};
-use gleaner_feed::Feed;
 use gleaner_host::api::Session;
 use gleaner_host::api::data::Wake;
 use gleaner_host::api::models::Models;
@@ -24,18 +23,17 @@ use gleaner_ingress::Ingress;
 use gleaner_lambda::manifest::{Limits, Manifest};
 use gleaner_lambda::{BuildDir, Clip, Fault, FaultKind};
 use gleaner_messages::Sources;
+use gleaner_messages::transport::loopback::Loopback;
+use gleaner_messages::transport::{Clock, Guid, SampleMeta};
 use gleaner_protocol::ingress::{
     AddReader, AddTopics, IngressControl, IngressReport, IngressStatus, IngressTopic, Qos,
-    TopicGrant,
+    TopicGrant, recorded_grant,
 };
-use gleaner_protocol::link::{
-    AddLambda, ControlClient, RecordedTopic, RecorderReport, recorded_grant,
-};
+use gleaner_protocol::link::{AddLambda, ControlClient, RecordedTopic, RecorderReport};
+use gleaner_protocol::process_stats::Heartbeat;
 use gleaner_protocol::{Handover, Report, Verified};
 use gleaner_recorder::program::{RecorderConnections, RecorderOptions, run as record};
-use gleaner_transport::loopback::Loopback;
-use gleaner_transport::{Clock, Guid, SampleMeta};
-use gleaner_vitals::Pulse;
+use gleaner_samples::Feed;
 use tempfile::TempDir;
 
 const MANIFEST: &str = "[lambda]\nname = \"adder\"\nversion = \"0.1.0\"\nkind = \"wasm\"\n\
@@ -195,7 +193,7 @@ impl RecordedRun {
         let wakes = Arc::<AtomicU64>::default();
         let counted = Arc::clone(&wakes);
         let run = ProgramThread::start(move |reports, starter| {
-            let pulse = Pulse::create().unwrap().0;
+            let heartbeat = Heartbeat::create().unwrap().0;
             let nowhere = File::options().write(true).open("/dev/null").unwrap();
             let run = LiveRun {
                 lambda: configured(&lambda),
@@ -204,8 +202,8 @@ impl RecordedRun {
                 feed: Feed::connect(socket).unwrap(),
                 starter: Some(starter),
                 recorder: Some(near),
-                results: ResultsPipe::over(nowhere, pulse.clone()),
-                pulse,
+                results: ResultsPipe::over(nowhere, heartbeat.clone()),
+                heartbeat,
                 close: &mut || Ok(Vec::new()),
                 stop: &stopped,
             };

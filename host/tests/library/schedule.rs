@@ -9,9 +9,9 @@ use gleaner_host::api::data::{Sample, Topic, Wake};
 use gleaner_host::input::open_inputs;
 use gleaner_host::schedule::WakeSchedule;
 use gleaner_lambda::manifest::Manifest;
+use gleaner_messages::transport::loopback::Loopback;
 use gleaner_tests::drive::TICKER_IMU;
 use gleaner_tests::root;
-use gleaner_transport::loopback::Loopback;
 
 use crate::meta;
 

@@ -55,8 +55,8 @@ fn a_connection_that_is_none_ends_the_run_with_an_error_that_names_it() {
     for (connection, cause) in [
         (null(), "on non-socket"),
         (pipe.into(), "on non-socket"),
-        (silent.into(), "it is no Unix socket"),
-        (listener.into(), "it is no Unix socket"),
+        (silent.into(), "it is not a Unix socket"),
+        (listener.into(), "it is not a Unix socket"),
     ] {
         let failure = Running::begin(None, Some(connection)).ended().unwrap_err();
         let text = failure.to_string();

@@ -74,47 +74,27 @@ fn the_most_significant_difference_of_a_header_comes_first() {
 
 #[test]
 fn files_and_config_that_only_one_side_has_are_differences() {
-    let difference = with(|now| now.files.remove(0).path.clear());
-    assert_differs(
-        difference,
-        "build file `brake_dark.wasm`",
-        "sha256 0123456789abcdef…",
-        "missing",
-    );
+    let (wasm, begin) = ("build file `brake_dark.wasm`", "sha256 0123456789abcdef…");
+    assert_differs(with(|now| now.files.remove(0).path.clear()), wasm, begin, "missing");
     // Only the relevant parts of the manifest are compared.
     assert_eq!(with(|now| now.files.remove(1).path.clear()), None);
     let more = FileDigest { path: "a.py".to_owned(), bytes: 1, sha256: "ab".repeat(32) };
-    assert_differs(
-        with(|now| now.files.push(more)),
-        "build file `a.py`",
-        "missing",
-        "sha256 abababababababab…",
-    );
-    let difference = with(|now| {
-        now.config.insert("new".to_owned(), json!(true));
-    });
-    assert_differs(difference, "config `new`", "missing", "true");
+    let digest = "sha256 abababababababab…";
+    assert_differs(with(|now| now.files.push(more)), "build file `a.py`", "missing", digest);
+    let more = || ("new".to_owned(), json!(true));
+    assert_differs(with(|now| now.config.extend([more()])), "config `new`", "missing", "true");
     assert_differs(with(|now| now.inputs.truncate(1)), "number of inputs", "2", "1");
 }
 
 #[test]
 fn digests_with_the_same_start_are_shown_completely() {
-    let begin = "0123456789abcdef";
+    let (file, begin) = ("build file `brake_dark.wasm`", "0123456789abcdef");
     let other = format!("{begin}{}", "0".repeat(48));
     let (journal, now) = (format!("sha256 {}", begin.repeat(4)), format!("sha256 {other}"));
-    assert_differs(
-        with(|header| header.files[0].sha256 = other),
-        "build file `brake_dark.wasm`",
-        &journal,
-        &now,
-    );
+    assert_differs(with(|header| header.files[0].sha256 = other), file, &journal, &now);
     // A digest in a journal may be any text.
-    assert_differs(
-        with(|header| header.files[0].sha256 = "ä".to_owned()),
-        "build file `brake_dark.wasm`",
-        "sha256 0123456789abcdef…",
-        "sha256 ä",
-    );
+    let difference = with(|header| header.files[0].sha256 = "ä".to_owned());
+    assert_differs(difference, file, "sha256 0123456789abcdef…", "sha256 ä");
 }
 
 fn entry() -> JournalEntry {
@@ -154,27 +134,17 @@ fn equal_wakes_do_not_differ() {
 fn causes_are_compared_including_the_writer() {
     assert_differs(changed(|now| now.at_ns = 11), "stamp of the wake, in ns", "10", "11");
     let writer = "ab".repeat(16);
-    let journal = format!("sample 4294967303 of writer {writer}");
-    let cause = "cause of the wake";
-    assert_differs(
-        changed(|now| now.cause = WakeSource::Tick { missed: 0 }),
-        cause,
-        &journal,
-        "a tick",
-    );
-    assert_differs(
-        changed(|now| now.cause = WakeSource::Tick { missed: 3 }),
-        cause,
-        &journal,
-        "a tick after 3 missed ones",
-    );
-    let now = format!("sample 4294967304 of writer {writer}");
-    assert_differs(
-        changed(|now| now.cause = WakeSource::Sample { writer: [0xab; 16], seq: (1 << 32) + 8 }),
-        cause,
-        &journal,
-        &now,
-    );
+    let sample = |seq: u64| format!("sample {seq} of writer {writer}");
+    let tick = |missed| WakeSource::Tick { missed };
+    let next = WakeSource::Sample { writer: [0xab; 16], seq: (1 << 32) + 8 };
+    for (cause, describe) in [
+        (tick(0), "a tick"),
+        (tick(3), "a tick after 3 missed ones"),
+        (next, &sample(4_294_967_304)),
+    ] {
+        let difference = changed(|now| now.cause = cause);
+        assert_differs(difference, "cause of the wake", &sample(4_294_967_303), describe);
+    }
 }
 
 #[test]
@@ -185,91 +155,52 @@ fn samples_of_a_clip_are_compared_as_far_as_a_clip_keeps_them() {
     assert_eq!(entry().differs_from(&now, &[], false), None);
     assert!(entry().differs_from(&now, &[], true).is_some());
     now.cause = WakeSource::Sample { writer: [1; 16], seq: 8 };
-    assert_differs(
-        entry().differs_from(&now, &[], false),
-        "cause of the wake",
-        "sample 7",
-        "sample 8",
-    );
+    let difference = entry().differs_from(&now, &[], false);
+    assert_differs(difference, "cause of the wake", "sample 7", "sample 8");
 }
 
 #[test]
 fn differences_of_samples_name_the_input() {
-    let input = "input `in0` (/wire0)";
-    assert_differs(
-        changed(|now| now.seen[0].new = 2),
-        &format!("number of new samples of {input}"),
-        "1",
-        "2",
-    );
-    let what = format!("newest sample of {input}");
-    assert_differs(
-        changed(|now| now.seen[0].newest = None),
-        &what,
-        &format!("7 of writer {}", "ab".repeat(16)),
-        "none",
-    );
-    let what = format!("samples of {input}");
-    assert_differs(
-        changed(|now| now.seen[0].digest = 0x1b),
-        &what,
-        "digest 0000001a",
-        "digest 0000001b",
-    );
+    let what = "number of new samples of input `in0` (/wire0)";
+    assert_differs(changed(|now| now.seen[0].new = 2), what, "1", "2");
+    let newest = format!("7 of writer {}", "ab".repeat(16));
+    let what = "newest sample of input `in0` (/wire0)";
+    assert_differs(changed(|now| now.seen[0].newest = None), what, &newest, "none");
+    let difference = changed(|now| now.seen[0].digest = 0x1b);
+    let what = "samples of input `in0` (/wire0)";
+    assert_differs(difference, what, "digest 0000001a", "digest 0000001b");
     let what = "number of samples of input `in1` (/wire1) that the lambda looked back";
     assert_differs(changed(|now| now.seen[1].reach = 9), what, "0", "9");
     assert_differs(changed(|now| now.seen.truncate(1)), "number of inputs", "2", "1");
     let mut now = entry();
     now.seen[1].new = 1;
-    assert_differs(
-        entry().differs_from(&now, &[], true),
-        "number of new samples of input 2",
-        "0",
-        "1",
-    );
+    let difference = entry().differs_from(&now, &[], true);
+    assert_differs(difference, "number of new samples of input 2", "0", "1");
 }
 
 #[test]
 fn triggers_are_compared_bit_for_bit() {
     assert_differs(changed(|now| now.triggers.clear()), "number of triggers", "1", "0");
-    assert_differs(
-        changed(|now| now.triggers[0].kind = TriggerKind::Stop),
-        "trigger 1: kind",
-        "event",
-        "stop",
-    );
-    assert_differs(
-        changed(|now| now.triggers[0].label = "x\u{1b}".to_owned()),
-        "trigger 1: label",
-        "`brake`",
-        "`x\\u{1b}`",
-    );
-    assert_differs(
-        changed(|now| now.triggers[0].score = Some(-0.0)),
-        "trigger 1: score",
-        "0",
-        "-0",
-    );
-    assert_differs(changed(|now| now.triggers[0].score = None), "trigger 1: score", "0", "none");
-    let attribute = |key: &str, value| {
-        let key = key.to_owned();
-        changed(|now| {
-            now.triggers[0].attributes.insert(key, value);
-        })
+    let trigger = |change: fn(&mut Trigger)| changed(|now| change(&mut now.triggers[0]));
+    let kind = trigger(|it| it.kind = TriggerKind::Stop);
+    assert_differs(kind, "trigger 1: kind", "event", "stop");
+    let label = trigger(|it| it.label = "x\u{1b}".to_owned());
+    assert_differs(label, "trigger 1: label", "`brake`", "`x\\u{1b}`");
+    assert_differs(trigger(|it| it.score = Some(-0.0)), "trigger 1: score", "0", "-0");
+    assert_differs(trigger(|it| it.score = None), "trigger 1: score", "0", "none");
+    let attribute = |key: &str, value, journal: &str, now: &str| {
+        let more = [(key.to_owned(), value)];
+        let difference = changed(|now| now.triggers[0].attributes.extend(more));
+        assert_differs(difference, &format!("trigger 1: attribute `{key}`"), journal, now);
     };
-    assert_differs(
-        attribute("a", json!(0.500_000_000_000_000_1)),
-        "trigger 1: attribute `a`",
-        "0.5",
-        "0.5000000000000001",
-    );
-    assert_differs(attribute("b", json!(1.0)), "trigger 1: attribute `b`", "1", "1.0");
-    assert_differs(attribute("c", json!("x")), "trigger 1: attribute `c`", "none", "\"x\"");
-    let difference = changed(|now| {
-        let first = now.triggers[0].attributes.shift_remove("a").unwrap();
-        now.triggers[0].attributes.insert("a".to_owned(), first);
+    attribute("a", json!(0.500_000_000_000_000_1), "0.5", "0.5000000000000001");
+    attribute("b", json!(1.0), "1", "1.0");
+    attribute("c", json!("x"), "none", "\"x\"");
+    let order = trigger(|it| {
+        let first = it.attributes.shift_remove("a").unwrap();
+        it.attributes.insert("a".to_owned(), first);
     });
-    assert_differs(difference, "trigger 1: order of its attributes", "a, b", "b, a");
+    assert_differs(order, "trigger 1: order of its attributes", "a, b", "b, a");
 }
 
 #[test]
@@ -285,12 +216,8 @@ fn faults_fuel_and_logs_are_compared() {
     assert_differs(changed(|now| now.fuel = Some(6)), "fuel", "5", "6");
     assert_differs(changed(|now| now.fuel = None), "fuel", "5", "none");
     assert_differs(changed(|now| now.log.lines = 2), "number of log lines", "1", "2");
-    assert_differs(
-        changed(|now| now.log.digest = 3),
-        "text of the log lines",
-        "digest 00000002",
-        "digest 00000003",
-    );
+    let text = changed(|now| now.log.digest = 3);
+    assert_differs(text, "text of the log lines", "digest 00000002", "digest 00000003");
 }
 
 #[test]

@@ -97,10 +97,8 @@ fn zeros_at_the_end_after_a_loss_of_power_are_a_torn_block() {
         if zeros > HEAD_LEN {
             *bytes.last_mut().unwrap() = 1;
             let (_, error) = read_all(&mut JournalReader::open(bytes.as_slice()).unwrap());
-            assert!(
-                matches!(error, Some(JournalError::Damaged { why: Damage::Head, .. })),
-                "{zeros}"
-            );
+            let is_damaged = matches!(error, Some(JournalError::Damaged { why: Damage::Head, .. }));
+            assert!(is_damaged, "{zeros}");
         }
     }
 }
@@ -109,14 +107,8 @@ fn zeros_at_the_end_after_a_loss_of_power_are_a_torn_block() {
 fn a_long_journal_is_written_in_blocks_of_256_wakes() {
     let entries = usual_entries(2, 20_000);
     let bytes = journal(&header(2), &entries, usize::MAX);
-    let mut at = PREAMBLE_LEN;
-    let mut lengths = Vec::new();
-    while at < bytes.len() {
-        let head = bytes[at..][..HEAD_LEN].try_into().unwrap();
-        let head = Head::from_bytes(head, lengths.len() as u64).unwrap();
-        lengths.push(head.len as usize);
-        at += HEAD_LEN + head.len as usize;
-    }
+    let offsets = offsets(&bytes);
+    let lengths: Vec<_> = offsets.windows(2).map(|pair| pair[1] - pair[0] - HEAD_LEN).collect();
     let wakes = &lengths[1..lengths.len() - 1];
     assert_eq!(wakes.len(), 20_000_usize.div_ceil(256), "{lengths:?}");
     assert!(wakes.iter().all(|len| (256..32_000).contains(len)), "{lengths:?}");

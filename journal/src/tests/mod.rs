@@ -190,8 +190,7 @@ fn read_all<R: std::io::Read>(
 
 /// Returns a journal of these blocks, with correct checksums.
 fn journal_of(blocks: &[(u8, Vec<u8>)]) -> Vec<u8> {
-    let mut bytes = MAGIC.to_vec();
-    bytes.extend_from_slice(&VERSION.to_le_bytes());
+    let mut bytes = [&MAGIC[..], &VERSION.to_le_bytes()].concat();
     bytes.resize(PREAMBLE_LEN, 0);
     for (index, (kind, payload)) in blocks.iter().enumerate() {
         let head =
@@ -200,6 +199,17 @@ fn journal_of(blocks: &[(u8, Vec<u8>)]) -> Vec<u8> {
         bytes.extend_from_slice(payload);
     }
     bytes
+}
+
+/// Returns the offset of each block of a complete journal, and its length.
+fn offsets(bytes: &[u8]) -> Vec<usize> {
+    let mut offsets = vec![PREAMBLE_LEN];
+    while let Some(head) = bytes[*offsets.last().unwrap()..].first_chunk() {
+        let head = Head::from_bytes(head, offsets.len() as u64 - 1).unwrap();
+        offsets.push(offsets.last().unwrap() + HEAD_LEN + head.len as usize);
+    }
+    assert_eq!(*offsets.last().unwrap(), bytes.len());
+    offsets
 }
 
 fn header_block(header: &JournalHeader) -> (u8, Vec<u8>) {

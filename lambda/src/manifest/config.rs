@@ -12,7 +12,6 @@ use gleaner_base::{Exit, Explain};
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[non_exhaustive]
 pub struct ConfigItem {
-    /// Name of the setting.
     pub name: ItemName,
     /// Default value. Its type is the type of the key.
     pub default: ConfigValue,
@@ -31,13 +30,10 @@ pub struct ConfigItem {
 #[derive(Debug, Clone, PartialEq, PartialOrd, Serialize, Deserialize)]
 #[serde(untagged)]
 pub enum ConfigValue {
-    /// `true` or `false`.
     Bool(bool),
     /// A whole number.
     Int(i64),
-    /// A number.
     Float(f64),
-    /// A text.
     Text(String),
 }
 
@@ -150,21 +146,15 @@ pub enum ConfigError {
     /// The lambda has no such item.
     #[error("lambda `{lambda}` has no config value `{name}`")]
     Unknown {
-        /// The lambda.
         lambda: String,
-        /// The given name.
         name: String,
         /// An item with a similar name.
         near: Option<String>,
-        /// All items.
         known: Vec<String>,
     },
-    /// The text has the wrong type.
     #[error("config value `{name}` cannot be `{text}`")]
     WrongType {
-        /// The item.
         name: String,
-        /// The given text.
         text: String,
         /// The expected value.
         wanted: &'static str,
@@ -172,13 +162,9 @@ pub enum ConfigError {
     /// The value is outside of the range in the manifest.
     #[error("config value `{name}` cannot be {value}: {}", range(min, max))]
     OutOfRange {
-        /// The item.
         name: String,
-        /// The given value.
         value: ConfigValue,
-        /// The smallest value.
         min: Option<ConfigValue>,
-        /// The largest value.
         max: Option<ConfigValue>,
     },
 }

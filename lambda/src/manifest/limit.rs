@@ -16,7 +16,7 @@ pub(super) trait Unit: Copy + Ord {
     fn read(table: &TomlTable, key: &str, bounds: &Bounds<Self>) -> Result<Self, ManifestError>;
 
     /// Returns the value as it is written in the file, without quotes.
-    fn in_words(self) -> String;
+    fn describe(self) -> String;
 
     /// Returns the value as in JSON and the SDKs: a number, bytes, or nanoseconds.
     fn plain(self) -> u64;
@@ -32,7 +32,7 @@ impl Unit for u64 {
         table.integer(key, bounds)
     }
 
-    fn in_words(self) -> String {
+    fn describe(self) -> String {
         self.to_string()
     }
 
@@ -56,7 +56,7 @@ impl Unit for ByteSize {
         table.size(key, bounds)
     }
 
-    fn in_words(self) -> String {
+    fn describe(self) -> String {
         self.to_string()
     }
 
@@ -80,7 +80,7 @@ impl Unit for Duration {
         table.duration(key, bounds)
     }
 
-    fn in_words(self) -> String {
+    fn describe(self) -> String {
         format_duration(self)
     }
 
@@ -115,7 +115,7 @@ impl Limit {
         let Bounds { min, default, max } = bounds;
         let word = |value: T| match T::NAME {
             "number" => grouped(value.plain()),
-            _ => value.in_words(),
+            _ => value.describe(),
         };
         let values = [min, default, max];
         Limit { key, unit: T::NAME, meaning, plain: values.map(T::plain), words: values.map(word) }

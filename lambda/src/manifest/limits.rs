@@ -76,8 +76,8 @@ macro_rules! limits {
             }
 
             /// Returns each key with its value, as written in the file.
-            pub fn in_words(&self) -> [(&'static str, String); Limits::KEYS.len()] {
-                [$((stringify!($key), self.$key.in_words())),+]
+            pub fn describe(&self) -> [(&'static str, String); Limits::KEYS.len()] {
+                [$((stringify!($key), self.$key.describe())),+]
             }
         }
     };
@@ -191,7 +191,7 @@ impl Limits {
     /// Returns the smaller value of each pair, and the limits that `max` reduced.
     pub fn tightened_by(&self, max: &Limits) -> (Limits, Vec<Tightened>) {
         let tight = self.smaller(max);
-        let pairs = self.in_words().into_iter().zip(tight.in_words());
+        let pairs = self.describe().into_iter().zip(tight.describe());
         let tightened = pairs.filter(|(before, after)| before != after);
         (tight, tightened.map(|((key, from), (_, to))| Tightened { key, from, to }).collect())
     }

@@ -1,5 +1,5 @@
-//! Parses `lambda.toml` once, into types that are valid by construction, so that no later code has
-//! to check again.
+//! Parses `lambda.toml` and `vehicle.toml` once, into types that are valid by construction, so that
+//! no later code has to check again.
 //!
 //! `table` and `value` walk the document, `read` parses each key, and `error` has the messages of a
 //! refusal: the file, the line, the key, the cause and help. The file system is used only to read
@@ -15,7 +15,6 @@ mod names;
 mod read;
 mod read_config;
 mod read_demand;
-mod read_limits;
 mod read_vehicle;
 mod reference;
 mod syntax;
@@ -24,6 +23,7 @@ mod table;
 mod tests;
 mod types;
 mod value;
+mod vehicle;
 
 pub use config::{ConfigError, ConfigItem, ConfigSet, ConfigValue};
 pub use error::{InputMemory, KeyLocation, ManifestError};
@@ -38,13 +38,15 @@ pub use types::{
     Backlog, Demand, Durability, InputSpec, LambdaKind, LambdaSection, Manifest, ModelSpec, Qos,
     RecordSpec, Reliability, ScheduleSpec, Store,
 };
+pub use vehicle::{
+    DeploymentSettings, InferenceLimits, MetricsSettings, NetworkSettings, RecordingSettings,
+    Vehicle, VehicleIdentity,
+};
 
 use std::io;
 use std::path::Path;
 
 use gleaner_base::{NotPlain, PlainFile};
-
-use crate::Vehicle;
 
 pub const MANIFEST_FILE: &str = "lambda.toml";
 
@@ -84,12 +86,8 @@ impl Manifest {
     }
 }
 
-pub(crate) fn vehicle(text: &str, file: &str) -> Result<Vehicle, ManifestError> {
-    read_vehicle::vehicle(&table::Document { text, file })
-}
-
 /// Reads a file in the format of a manifest, which a user has named.
-pub(crate) fn read_text(path: &Path) -> Result<String, ManifestError> {
+fn read_text(path: &Path) -> Result<String, ManifestError> {
     text(path, PlainFile::named(path, bounds::MANIFEST_MAX))
 }
 

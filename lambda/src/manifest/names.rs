@@ -89,7 +89,7 @@ macro_rules! checked_text {
         impl<'de> Deserialize<'de> for $name {
             fn deserialize<D: Deserializer<'de>>(from: D) -> Result<Self, D::Error> {
                 // Not the error itself, which holds the text, however long it is.
-                let refused = |_| D::Error::custom(concat!("it is no ", $what));
+                let refused = |_| D::Error::custom(concat!("it is not a ", $what));
                 Cow::<str>::deserialize(from)?.parse().map_err(refused)
             }
         }

@@ -6,7 +6,6 @@ use super::bounds;
 use super::error::{InputMemory, ManifestError};
 use super::read_config;
 use super::read_demand;
-use super::read_limits;
 use super::syntax;
 use super::table::{Document, TomlTable};
 use super::value::TomlValue;
@@ -51,10 +50,16 @@ pub(super) fn manifest(document: &Document) -> Result<Manifest> {
         inputs,
         models,
         record: root.get("record").map(|value| record(document, &value)).transpose()?,
-        limits: read_limits::limits(root.get("limits").as_ref(), Limits::DEFAULT)?,
+        limits: limits(root.get("limits").as_ref(), Limits::DEFAULT)?,
         demand: demand.transpose()?.unwrap_or_default(),
         config: root.get("config").map_or(Ok(Vec::new()), |value| read_config::items(&value))?,
     })
+}
+
+/// Parses `[limits]`, also of a vehicle; limits that it does not name are those of `missing`.
+pub(super) fn limits(value: Option<&TomlValue>, missing: Limits) -> Result<Limits> {
+    value
+        .map_or(Ok(missing), |value| Limits::read(&value.table("[limits]", Limits::KEYS)?, missing))
 }
 
 fn lambda(value: &TomlValue) -> Result<LambdaSection> {

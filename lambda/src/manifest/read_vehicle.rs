@@ -8,15 +8,15 @@ use toml::de::DeTable;
 
 use super::bounds::{self, Bounds};
 use super::error::ManifestError;
-use super::read_limits::limits;
+use super::read::limits;
 use super::syntax;
 use super::table::{Document, TomlTable};
 use super::value::TomlValue;
-use super::{Limits, TopicName};
-use crate::vehicle::{
+use super::vehicle::{
     DeploymentSettings, InferenceLimits, MetricsSettings, NetworkSettings, RecordingSettings,
     Vehicle, VehicleIdentity,
 };
+use super::{Limits, TopicName};
 
 type Result<T> = std::result::Result<T, ManifestError>;
 

@@ -59,7 +59,6 @@ pub struct LambdaSection {
     pub deterministic: bool,
 }
 
-/// The kinds of lambda.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum LambdaKind {
@@ -154,7 +153,6 @@ impl InputSpec {
     }
 }
 
-/// QoS of a subscription.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Qos {
@@ -273,7 +271,6 @@ impl Demand {
 }
 
 impl Manifest {
-    /// Returns the input of this name.
     pub fn input(&self, name: &str) -> Option<&InputSpec> {
         self.inputs.iter().find(|input| input.name == name)
     }

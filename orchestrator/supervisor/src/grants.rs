@@ -3,8 +3,9 @@
 use std::collections::HashSet;
 
 use gleaner_lambda::Manifest;
-use gleaner_protocol::ingress::{AddReader, PublishGrant, Qos, TopicGrant};
-use gleaner_protocol::link::{COMMANDS_ID, commands_grant, recorded_grant};
+use gleaner_protocol::ingress::{
+    AddReader, COMMANDS_ID, PublishGrant, Qos, TopicGrant, commands_grant, recorded_grant,
+};
 
 use crate::spec::LambdaSpec;
 use crate::spec::RunSpec;
@@ -57,8 +58,8 @@ pub(crate) fn again(reader: AddReader, is_recorded: bool) -> AddReader {
 
 /// The recorded topics of all lambdas of a run, each once.
 pub(crate) struct RecordedTopics {
-    /// Topics that lambdas request with different QoS.
-    mixed: Vec<String>,
+    /// Topics that lambdas request with different QoS: each QoS has stamps of its own.
+    pub(crate) mixed: Vec<String>,
     grants: Vec<TopicGrant>,
     /// Ids of the topics that were granted to the recorder.
     granted: HashSet<u32>,
@@ -105,12 +106,6 @@ impl RecordedTopics {
         Ok(())
     }
 
-    /// Returns the topics that lambdas request with different QoS: each QoS has stamps of its own.
-    pub(crate) fn mixed(&self) -> impl Iterator<Item = &str> {
-        self.mixed.iter().map(String::as_str)
-    }
-
-    /// Returns the recorded topics of a lambda, with their ids.
     pub(crate) fn ids(&self, lambda: &LambdaSpec) -> Vec<(String, u32)> {
         let grants = self.grants_of(lambda);
         grants.into_iter().map(|grant| (grant.topic.clone(), grant.id)).collect()

@@ -1,6 +1,5 @@
 //! The ingress of a run, over its restarts.
 
-use std::process::ExitStatus;
 use std::sync::mpsc::SyncSender;
 
 use gleaner_base::{Exit, Failure, chain};
@@ -12,7 +11,7 @@ use gleaner_protocol::link::LinkError;
 
 use crate::farewell;
 use crate::observer::RunObserver;
-use crate::output::{ChildId, ChildOutput, PIPES};
+use crate::output::{ChildId, ChildOutput};
 use crate::process::ChildProcess;
 use crate::restart_delay::SILENCE;
 use crate::service_restarts::ServiceRestarts;
@@ -21,7 +20,6 @@ use crate::{RunContext, arguments};
 pub(crate) struct IngressProcess {
     pub(crate) child: ChildProcess,
     pub(crate) control: IngressControl,
-    pub(crate) open_pipes: u8,
     /// It is ready when it has joined the network, or opened the drive.
     pub(crate) restarts: ServiceRestarts,
     pub(crate) drive_ended: bool,
@@ -67,7 +65,7 @@ impl IngressProcess {
         })?;
         let child = ChildProcess::start(
             &context.parts,
-            ("gleaner-ingress", ChildId::Ingress { start }, ""),
+            ("gleaner-ingress", ChildId::Ingress(start), ""),
             arguments::ingress(context.spec, largest, context.offset_ns),
             None,
             Handover { control: Some(ingress_end), ..Handover::default() },
@@ -76,7 +74,6 @@ impl IngressProcess {
         Ok(Self {
             child,
             control,
-            open_pipes: PIPES,
             is_joined: start == 0,
             restarts,
             drive_ended: false,
@@ -129,10 +126,6 @@ impl IngressProcess {
         if let Some(joined) = self.joined.take() {
             farewell::send(&joined);
         }
-    }
-
-    pub(crate) fn end_reason(&self, status: ExitStatus) -> String {
-        self.restarts.reason("the ingress", status)
     }
 
     /// Returns the reason why it receives no further samples; of a drive, why it ended early.

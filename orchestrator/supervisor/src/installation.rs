@@ -4,9 +4,8 @@ use std::fs;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-use gleaner_parts::Parts;
+use gleaner_base::programs::InstalledPrograms;
 
-/// The installation that this program was started from.
 pub(crate) struct Installation {
     /// Path of this program, and its file; `None` if unknown.
     program: Option<(PathBuf, FileId)>,
@@ -16,7 +15,7 @@ type FileId = (u64, u64);
 
 impl Installation {
     /// Returns the installation `parts`, to which the running program belongs.
-    pub(crate) fn of(parts: &Parts) -> Self {
+    pub(crate) fn of(parts: &InstalledPrograms) -> Self {
         // Not the path that the kernel gives: the installation may be behind a link, which moves.
         let path = parts.program("gleaner-supervisor").ok();
         Self { program: path.zip(id(Path::new("/proc/self/exe"))) }

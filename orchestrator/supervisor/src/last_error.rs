@@ -1,4 +1,7 @@
-//! The last message that a process writes to standard error: it explains its end.
+//! The reason of an end that was not requested: the last message that the process has written to
+//! standard error explains it.
+
+use std::process::ExitStatus;
 
 use gleaner_base::in_one_line;
 
@@ -39,6 +42,11 @@ impl LastError {
         let text = in_one_line(self.message().unwrap_or(&self.line));
         (!text.is_empty()).then_some(text)
     }
+}
+
+/// Returns the text for a process that ended without a request.
+pub(crate) fn unexpected_end(process: &str, status: ExitStatus) -> String {
+    format!("{process} ended unexpectedly ({status})")
 }
 
 #[cfg(test)]

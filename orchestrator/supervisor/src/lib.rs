@@ -1,18 +1,19 @@
 //! Starts and supervises the processes that run lambdas on a vehicle: an ingress, a recorder, a
-//! process for models, and one for each lambda. `gleaner run` uses it.
+//! process for models, and one for each lambda. `gleaner run` and `gleaner-supervisor` use it.
 //!
 //! - `spec`: what a run consists of. `observer`: its events, for those who watch it.
 //! - `grants`, `arguments`: topics and arguments of the processes.
 //! - `process`, `output`, `lines`, `byte_rate`: one process, and the threads that read its output.
 //! - `ingress`, `recorder`, `inference`: the processes that all lambdas share, each over its
-//!   restarts (`service_restarts`). `last_error`: the message that explains an end. `farewell`: the
-//!   end of the ingress, as other nodes see it.
-//! - `supervised`, `lambda_state`: one lambda over all its restarts, with `summary` and
-//!   `recent_wakes`.
-//! - `process_group`: all processes, `group_end`: their end, and `drive`: a drive that the ingress
-//!   plays.
+//!   restarts (`service_restarts`). `last_error`: the reason of an end. `farewell`: the end of the
+//!   ingress, as other nodes see it.
+//! - `supervised`: one lambda over all its restarts, with `summary`, `recent_wakes` and
+//!   `revision_check`, which compares its files with their signature.
+//! - `process_group`: all processes, and `drive`: a drive that the ingress plays.
 //! - `failures`: the result of a run in which processes failed.
-//! - `installation`: the programs on the disk, which an upgrade replaces.
+//! - `service`: the program `gleaner-supervisor`, with `reconcile`, `event_log` and `installation`:
+//!   the programs on the disk, which an upgrade replaces.
+//! - `wheels`: Python environments of deployed lambdas.
 //!
 //! A failed process is restarted alone, with a growing delay (`restart_delay`); the others receive
 //! a connection to the next one, and lambdas decide without a recorder meanwhile. A first start
@@ -20,28 +21,20 @@
 
 mod arguments;
 mod byte_rate;
-mod crash_loop;
 mod drive;
 mod event_log;
 mod failures;
 mod farewell;
 mod grants;
-mod group_end;
-mod group_output;
 mod inference;
 mod ingress;
 mod installation;
-mod lambda_process;
-mod lambda_state;
 mod last_error;
 pub mod lines;
 mod observer;
 mod output;
 mod process;
 mod process_group;
-#[cfg(test)]
-#[path = "../../../tests/src/random.rs"]
-mod random;
 mod recent_wakes;
 mod reconcile;
 mod recorder;
@@ -52,22 +45,22 @@ mod service_restarts;
 mod spec;
 mod summary;
 mod supervised;
+pub mod wheels;
 
 use std::ffi::OsString;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use gleaner_base::programs::InstalledPrograms;
 use gleaner_base::{Exit, Failure};
 use gleaner_lambda::Vehicle;
-use gleaner_parts::Parts;
 
 pub use event_log::EventLog;
 use failures::Failures;
-use group_end::GroupEnd;
 pub use inference::{InferenceEvent, InferenceService, InferenceUse};
 pub use observer::{RestartedPart, RunObserver};
-use process_group::{ProcessGroup, RunRecord};
+use process_group::{GroupEnd, ProcessGroup, RunRecord};
 pub use reconcile::{Action, KnownLambda, reconcile};
 use restart_delay::RestartDelay;
 pub use spec::{ClipSigning, LambdaSpec, RunSpec};
@@ -84,7 +77,7 @@ const POLL_INTERVAL: Duration = Duration::from_millis(100);
 
 struct RunContext<'a> {
     spec: &'a RunSpec,
-    parts: Parts,
+    parts: InstalledPrograms,
     /// Offset of the vehicle's clock to CLOCK_MONOTONIC, in ns.
     offset_ns: i64,
 }
@@ -107,12 +100,6 @@ impl RunTime {
         self.ready.zip(self.limit).is_some_and(|(ready, limit)| ready.elapsed() >= limit)
     }
 
-    /// Returns whether the time since the start of the run is over before all lambdas were ready.
-    fn is_over_before_ready(&self) -> bool {
-        self.ready.is_none() && self.is_over_since_start()
-    }
-
-    /// Returns whether the time since the start of the run is over.
     fn is_over_since_start(&self) -> bool {
         self.limit.is_some_and(|limit| self.started.elapsed() >= limit)
     }
@@ -135,7 +122,7 @@ pub fn run(
     let mut lambdas: Vec<_> = lambdas.into_iter().map(SupervisedLambda::new).collect();
     let allowed = || spec.vehicle.as_ref().map_or(Ok(Vehicle::default()), Vehicle::load);
     let mut vehicle = allowed()?;
-    let context = RunContext { spec, parts: Parts::find()?, offset_ns: clock_offset() };
+    let context = RunContext { spec, parts: InstalledPrograms::find()?, offset_ns: clock_offset() };
     let mut time = RunTime { limit: spec.duration, started: Instant::now(), ready: None };
     let mut delay = RestartDelay::new();
     let mut restarts = 0;
@@ -179,7 +166,7 @@ pub fn run(
             break;
         }
     }
-    let exits = lambdas.iter().map(|lambda| lambda.exit);
+    let exits = lambdas.iter().map(SupervisedLambda::exit);
     let exit = exits.reduce(|first, next| if first == Exit::Ok { next } else { first });
     for lambda in lambdas {
         lambda.complete(&counts)?;

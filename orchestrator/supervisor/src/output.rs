@@ -17,33 +17,30 @@ use crate::byte_rate::ByteRate;
 use crate::inference::InferenceEvent;
 use crate::lines::{next_report, pass_on};
 
-/// Number of pipes of a process.
 pub(crate) const PIPES: u8 = 2;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum ChildId {
-    /// `start` counts the restarts, so that output of an earlier process is not taken for that of
+    /// With the number of restarts, so that output of an earlier process is not taken for that of
     /// the current one.
-    Ingress {
-        start: u32,
-    },
+    Ingress(u32),
     /// As of the ingress.
-    Recorder {
-        start: u32,
-    },
+    Recorder(u32),
     Inference,
     /// This process.
     Supervisor,
     /// A process of a lambda, by its number in the group.
-    Lambda {
-        process: u32,
-    },
+    Lambda(u32),
 }
 
 pub(crate) struct ChildOutput {
     pub(crate) from: ChildId,
     pub(crate) piece: OutputPiece,
 }
+
+/// Wakes the receiver. If that has no room, it is awake.
+pub(crate) const NOTICE: ChildOutput =
+    ChildOutput { from: ChildId::Supervisor, piece: OutputPiece::Notice };
 
 pub(crate) enum OutputPiece {
     Runtime(Report),
@@ -54,8 +51,7 @@ pub(crate) enum OutputPiece {
     Unparsable(String),
     /// A piece of standard error, with the prefix of its process at the start of a line.
     Stderr(Vec<u8>),
-    /// Wakes the receiver.
-    Bell,
+    Notice,
     /// One of its [`PIPES`] is closed.
     Closed,
 }
@@ -75,9 +71,9 @@ pub(crate) fn forward(
         let send = send(sender.clone());
         thread::spawn(move || {
             match from {
-                ChildId::Ingress { .. } => follow(reports, OutputPiece::Ingress, &send),
-                ChildId::Recorder { .. } => follow(reports, OutputPiece::Recorder, &send),
-                ChildId::Lambda { .. } => follow(reports, OutputPiece::Runtime, &send),
+                ChildId::Ingress(_) => follow(reports, OutputPiece::Ingress, &send),
+                ChildId::Recorder(_) => follow(reports, OutputPiece::Recorder, &send),
+                ChildId::Lambda(_) => follow(reports, OutputPiece::Runtime, &send),
                 // Its service reads it, and the supervisor has no process here.
                 ChildId::Inference | ChildId::Supervisor => {}
             }
@@ -89,7 +85,7 @@ pub(crate) fn forward(
         thread::spawn(move || {
             let mut begins_line = true;
             // Gleaner's other programs write what they choose.
-            let mut rate = matches!(from, ChildId::Lambda { .. }).then(ByteRate::new);
+            let mut rate = matches!(from, ChildId::Lambda(_)).then(ByteRate::new);
             let dropped = |bytes: u64, begins_line: bool| {
                 let end = if begins_line { "" } else { "\n" };
                 let text = format!("{end}{prefix}{bytes} bytes of standard error were dropped\n");

@@ -10,8 +10,8 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::mpsc::SyncSender;
 use std::time::{Duration, Instant};
 
+use gleaner_base::programs::InstalledPrograms;
 use gleaner_base::{Exit, Failure};
-use gleaner_parts::Parts;
 use gleaner_protocol::link::LinkError;
 use gleaner_protocol::{Handover, SHUTDOWN_TIMEOUT};
 use rustix::net::sockopt::set_socket_send_buffer_size;
@@ -33,7 +33,7 @@ pub(crate) struct ChildProcess {
     child: Child,
     /// Our end of its standard input: open, as its end would mean that this program has ended.
     handover: UnixStream,
-    /// Time of the request to end.
+    /// Time of the request to end or of the first check whether it is late, then of the last kill.
     requested: Option<Instant>,
 }
 
@@ -42,7 +42,7 @@ impl ChildProcess {
     /// its standard error. `shim` are the arguments of gleaner-shim, which starts the program if
     /// they are given, and the interpreter that the program has to use, if it runs Python.
     pub(crate) fn start(
-        parts: &Parts,
+        parts: &InstalledPrograms,
         (name, id, prefix): (&'static str, ChildId, &str),
         line: Vec<OsString>,
         shim: Option<(Vec<OsString>, Option<&Path>)>,
@@ -79,7 +79,6 @@ impl ChildProcess {
         self.child.id()
     }
 
-    /// Returns the exit status of the process; `None` while it runs.
     pub(crate) fn status(&mut self) -> Result<Option<ExitStatus>, Failure> {
         let failed = |error| {
             Failure::caused_by(Exit::Internal, format!("cannot wait for {}", self.name), &error)
@@ -100,12 +99,10 @@ impl ChildProcess {
         }
     }
 
-    /// Sends SIGKILL.
     pub(crate) fn kill(&self) {
         self.signal(Signal::KILL);
     }
 
-    /// Sends SIGTERM.
     pub(crate) fn terminate(&mut self) {
         self.signal(Signal::TERM);
         self.requested = Some(Instant::now());
@@ -141,14 +138,9 @@ impl Drop for ChildProcess {
     }
 }
 
-/// Returns the text for a process that ended without a request.
-pub(crate) fn ended(process: &str, status: ExitStatus) -> String {
-    format!("{process} ended unexpectedly ({status})")
-}
-
 /// Returns the program to start and its arguments: `name`, or the shim that starts it.
 fn command_line(
-    parts: &Parts,
+    parts: &InstalledPrograms,
     name: &str,
     line: Vec<OsString>,
     shim: Option<Vec<OsString>>,

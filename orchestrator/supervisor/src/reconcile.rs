@@ -5,13 +5,13 @@ use gleaner_protocol::supervision::{DesiredLambda, DesiredState};
 /// A lambda that runs, waits, or is ending.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct KnownLambda<'a> {
-    /// The wanted state by which it runs.
+    /// The desired state by which it runs.
     pub lambda: &'a DesiredLambda,
     /// True if it was requested to end.
     pub is_leaving: bool,
 }
 
-/// A step towards the wanted state.
+/// A step towards the desired state.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Action {
     Start(DesiredLambda),
@@ -36,7 +36,7 @@ pub fn reconcile(desired: &DesiredState, known: &[KnownLambda<'_>]) -> Vec<Actio
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::XorShift64;
+    use gleaner_test_support::random::XorShift64;
 
     fn lambda(id: &str, revision: &str) -> DesiredLambda {
         DesiredLambda {

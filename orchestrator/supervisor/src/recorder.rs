@@ -13,16 +13,13 @@ use gleaner_protocol::ingress::AddTopics;
 use gleaner_protocol::link::{AddLambda, ControlClient, LinkError, RecorderReport, RecorderStatus};
 
 use crate::grants::{self, RecordedTopics};
-use crate::group_end::GroupEnd;
 use crate::ingress::IngressProcess;
-use crate::observer::{RestartedPart, RunObserver};
-use crate::output::{ChildId, ChildOutput, PIPES};
+use crate::observer::RunObserver;
+use crate::output::{ChildId, ChildOutput};
 use crate::process::ChildProcess;
-use crate::process_group::ProcessGroup;
 use crate::restart_delay::SILENCE;
 use crate::service_restarts::ServiceRestarts;
 use crate::spec::LambdaSpec;
-use crate::supervised::SupervisedLambda;
 use crate::{RunContext, arguments};
 
 /// Time for the recorder to become ready: on a busy machine, with a large preroll to allocate. The
@@ -32,7 +29,6 @@ const READY: Duration = Duration::from_secs(120);
 pub(crate) struct RecorderProcess {
     /// `None` if it could not be started.
     process: Option<(ChildProcess, ControlClient)>,
-    pub(crate) open_pipes: u8,
     /// It is ready when it accepts lambdas.
     pub(crate) restarts: ServiceRestarts,
     pub(crate) topics: RecordedTopics,
@@ -53,7 +49,7 @@ impl RecorderProcess {
         ingress: &mut IngressProcess,
         sender: &SyncSender<ChildOutput>,
     ) -> Option<(Self, Option<Failure>)> {
-        let restarts = before.map_or_else(ServiceRestarts::first, |it| it.restarts.next());
+        let mut restarts = before.map_or_else(ServiceRestarts::first, |it| it.restarts.next());
         let start = restarts.start;
         let added = ingress.control.add_reader(&grants::recorder(context.spec, start));
         let ingress = ingress.granted(added)?;
@@ -61,10 +57,12 @@ impl RecorderProcess {
         let started = start_process(context, start, line, ingress, sender);
         let (process, failure) = match started {
             Ok(process) => (Some(process), None),
-            Err(failure) => (None, Some(failure)),
+            Err(failure) => {
+                restarts.open_pipes = 0;
+                (None, Some(failure))
+            }
         };
         let recorder = Self {
-            open_pipes: if process.is_some() { PIPES } else { 0 },
             process,
             restarts,
             // The samples of the time without a recorder are in the memory of the ingress.
@@ -109,7 +107,6 @@ impl RecorderProcess {
         }
     }
 
-    /// Returns its process; `None` if it could not be started.
     pub(crate) fn child(&mut self) -> Option<&mut ChildProcess> {
         self.process.as_mut().map(|(child, _)| child)
     }
@@ -138,7 +135,7 @@ impl RecorderProcess {
 
     /// Kills it, so that another one is started, if it does not become ready, or does not report
     /// any more.
-    fn kill_if_silent(&mut self) {
+    pub(crate) fn kill_if_silent(&mut self) {
         let (most, what) = match self.restarts.is_ready {
             true => (SILENCE, "has not reported for"),
             false => (READY, "was not ready after"),
@@ -176,7 +173,6 @@ impl RecorderProcess {
     }
 }
 
-/// Starts the program, with its connection to the ingress.
 fn start_process(
     context: &RunContext<'_>,
     start: u32,
@@ -197,7 +193,7 @@ fn start_process(
         key: key.map(OwnedFd::from),
         ..Handover::default()
     };
-    let name = ("gleaner-recorder", ChildId::Recorder { start }, "");
+    let name = ("gleaner-recorder", ChildId::Recorder(start), "");
     let child = ChildProcess::start(&context.parts, name, line, None, connections, sender)?;
     Ok((child, control))
 }
@@ -207,85 +203,4 @@ fn closed_connection() -> Result<OwnedFd, Failure> {
     let pair = UnixStream::pair();
     pair.map(|(lambda_end, _)| lambda_end.into())
         .map_err(|error| Failure::caused_by(Exit::Internal, "cannot create a socket", &error))
-}
-
-impl ProcessGroup<'_> {
-    /// Starts the recorder if it is needed and does not run, and connects the processes that run.
-    pub(crate) fn start_recorder(&mut self) -> Result<(), Failure> {
-        let spec = self.context.spec;
-        let is_recorded = |supervised: &&SupervisedLambda| {
-            spec.records && supervised.lambda.manifest.record.is_some()
-        };
-        let is_due = match &self.recorder {
-            None => self.lambdas.iter().any(|it| is_recorded(&it)),
-            Some(recorder) => recorder.restarts.is_due(),
-        };
-        if !is_due {
-            return Ok(());
-        }
-        let recorded = self.lambdas.iter().filter(is_recorded).map(|it| &it.lambda);
-        let Self { context, ingress, sender, .. } = self;
-        let before = self.recorder.as_ref();
-        let started = RecorderProcess::start(before, context, recorded, ingress, sender);
-        let Some((mut next, failure)) = started else { return Ok(()) };
-        let is_first = next.restarts.start == 0;
-        match failure {
-            // On a vehicle, lambdas run on without it.
-            Some(failure) if is_first && !spec.is_vehicle() => return Err(failure),
-            Some(failure) => {
-                let (reason, delay) = next.restarts.not_started(&failure);
-                let starts = next.restarts.start + 1;
-                self.observer.restarts(RestartedPart::Recorder, &reason, delay, starts);
-                self.recorder = Some(next);
-                return Ok(());
-            }
-            None => {}
-        }
-        if is_first {
-            next.topics.mixed().for_each(|topic| {
-                self.observer.warn(&format!(
-                    "lambdas request `{topic}` with different `qos`: clips have the samples of the \
-                     first, and are not verified for the others"
-                ));
-            });
-        }
-        let recorder = self.recorder.insert(next);
-        let running = self.lambdas.iter_mut().filter(|it| it.is_running() && is_recorded(&&**it));
-        for supervised in running {
-            let lambda = &supervised.lambda;
-            let connected = recorder.connect(lambda, self.vehicle.limits, &mut self.ingress)?;
-            let Some(socket) = connected else { return Ok(()) };
-            let passed = Handover { recorder: Some(socket), ..Handover::default() };
-            supervised.pass(&passed, self.observer);
-        }
-        Ok(())
-    }
-
-    /// Notes the end of the recorder: another one is to be started. Returns the end of the group if
-    /// all others must end with it.
-    pub(crate) fn ended_recorder(&mut self) -> Result<Option<GroupEnd>, Failure> {
-        let Some(recorder) = &mut self.recorder else { return Ok(None) };
-        if recorder.restarts.has_ended() {
-            return Ok(None);
-        }
-        let Some(child) = recorder.child() else { return Ok(None) };
-        let Some(status) = child.status()? else {
-            recorder.kill_if_silent();
-            return Ok(None);
-        };
-        let has_started = recorder.restarts.is_ready || recorder.restarts.start > 0;
-        // Its ingress may have ended before it was ready.
-        let has_lost_ingress = self.ingress.restarts.start > 0 || self.ingress.restarts.has_ended();
-        let is_first = !has_started && !has_lost_ingress && !self.context.spec.is_vehicle();
-        if is_first || !self.context.spec.drives.is_empty() {
-            return Ok(Some(GroupEnd::of("the recorder", status, is_first)));
-        }
-        self.drain(|group| group.recorder.as_ref().is_some_and(|it| it.open_pipes > 0));
-        let Some(recorder) = &mut self.recorder else { return Ok(None) };
-        let reason = recorder.restarts.reason("the recorder", status);
-        let (delay, starts) = (recorder.restarts.ended(status), recorder.restarts.start + 1);
-        self.observer.restarts(RestartedPart::Recorder, &reason, delay, starts);
-        self.failures.add(reason, false);
-        Ok(None)
-    }
 }

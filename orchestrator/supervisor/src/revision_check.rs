@@ -9,9 +9,9 @@ use gleaner_base::{PlainFile, chain, is_shortage};
 use gleaner_lambda::BuildDir;
 use gleaner_protocol::supervision::DesiredLambda;
 use gleaner_trust::{FileDigestError, Payload, Revision, check_files, revision_of_digest};
-use gleaner_wheels::PreparedPython;
 
-use crate::output::{ChildId, ChildOutput, OutputPiece};
+use crate::output::{ChildOutput, NOTICE};
+use crate::wheels::{self, PreparedPython};
 
 /// The environment of a lambda that has wheels, or the reason why it does not start.
 pub(crate) type CheckResult = Result<Option<PreparedPython>, CheckFailure>;
@@ -43,9 +43,7 @@ impl RevisionCheck {
         // Without a thread, the dropped sender is the result.
         let _ = thread.spawn(move || {
             let _ = sender.send(check(&deployment));
-            // If it is full, the loop is awake.
-            let _ =
-                bell.try_send(ChildOutput { from: ChildId::Supervisor, piece: OutputPiece::Bell });
+            let _ = bell.try_send(NOTICE);
         });
         Self { result }
     }
@@ -78,5 +76,5 @@ fn check(deployment: &DesiredLambda) -> CheckResult {
     let refused = |error: FileDigestError| failed("its files are refused", &error);
     let revision = revision_of_digest(&envelope, &digest).map_err(|it| refused(it.into()))?;
     check_files(&revision, &BuildDir::of(folder)).map_err(refused)?;
-    gleaner_wheels::prepare(folder).map_err(|error| failed("it has no Python environment", &error))
+    wheels::prepare(folder).map_err(|error| failed("it has no Python environment", &error))
 }

@@ -5,8 +5,8 @@ use std::time::{Duration, Instant};
 
 use gleaner_base::Failure;
 
-use crate::last_error::LastError;
-use crate::process::ended;
+use crate::last_error::{LastError, unexpected_end};
+use crate::output::PIPES;
 use crate::restart_delay::{ServiceDelays, was_killed};
 
 /// One process, and the number of those before it.
@@ -14,6 +14,7 @@ use crate::restart_delay::{ServiceDelays, was_killed};
 pub(crate) struct ServiceRestarts {
     /// Number of earlier processes.
     pub(crate) start: u32,
+    pub(crate) open_pipes: u8,
     /// Set when it has reported that it is ready, until its end.
     pub(crate) is_ready: bool,
     started: Instant,
@@ -45,6 +46,7 @@ impl ServiceRestarts {
         let now = Instant::now();
         Self {
             start,
+            open_pipes: PIPES,
             is_ready: false,
             started: now,
             delays,
@@ -65,7 +67,6 @@ impl ServiceRestarts {
         self.again_at.is_some()
     }
 
-    /// Returns whether the next one is to be started now.
     pub(crate) fn is_due(&self) -> bool {
         self.again_at.is_some_and(|at| Instant::now() >= at)
     }
@@ -79,7 +80,6 @@ impl ServiceRestarts {
         self.error.add(text, "");
     }
 
-    /// Returns whether it has not reported for this time.
     pub(crate) fn is_silent(&self, most: Duration) -> bool {
         self.reported.elapsed() > most
     }
@@ -99,9 +99,9 @@ impl ServiceRestarts {
         match (&self.requested, self.error.in_one_line()) {
             (Some(requested), _) => requested.reason.clone(),
             (None, Some(cause)) if !was_killed(status) => {
-                format!("{}: {cause}", ended(name, status))
+                format!("{}: {cause}", unexpected_end(name, status))
             }
-            (None, _) => ended(name, status),
+            (None, _) => unexpected_end(name, status),
         }
     }
 

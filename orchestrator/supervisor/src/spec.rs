@@ -77,14 +77,18 @@ pub struct LambdaSpec {
     pub set: Vec<String>,
     /// Renamed topics: from and to.
     pub remaps: Vec<(String, String)>,
-    /// Its deployment, on a vehicle: then its files are checked before each start, and it is
-    /// started again after every end, unless it fails too often.
+    /// Its deployment, on a vehicle: then its files are checked before each start.
     pub deployment: Option<Box<DesiredLambda>>,
 }
 
 impl LambdaSpec {
     pub fn name(&self) -> &str {
         self.manifest.lambda.name.as_str()
+    }
+
+    /// Returns whether it is started again after every end, unless it fails too often.
+    pub(crate) fn is_kept(&self) -> bool {
+        self.deployment.is_some()
     }
 
     /// Returns the path of the record of how its process ended.

@@ -9,7 +9,7 @@ use gleaner_base::{Exit, Failure, PlainFile, write_atomically};
 use gleaner_lambda::results::SUMMARY_MAX;
 use gleaner_protocol::ingress::IngressStatus;
 use gleaner_protocol::link::RecorderStatus;
-use gleaner_protocol::{LiveStatus, NetworkStatus, WakeCounts};
+use gleaner_protocol::{LiveStatus, NetworkStatus};
 
 use crate::recent_wakes::RecentWakes;
 
@@ -65,7 +65,7 @@ impl RunCounts {
 pub(crate) struct EarlierCounts {
     live: Option<LiveStatus>,
     /// Those of the last minutes, with the current process.
-    recent: RecentWakes,
+    pub(crate) recent: RecentWakes,
     /// Wakes during which their process ended, so that it did not count them.
     lost_wakes: u64,
 }
@@ -76,11 +76,6 @@ impl EarlierCounts {
         if let Some(all) = self.with(Some(last)) {
             self.recent.add(all.wake_counts(), Instant::now());
         }
-    }
-
-    /// Returns the wakes of the last minutes.
-    pub(crate) fn recent(&self) -> WakeCounts {
-        self.recent.get()
     }
 
     /// Adds the last status of an ended process. If it failed, up to a second of counts is missing.
@@ -102,10 +97,6 @@ impl EarlierCounts {
 
     /// Adds the last process and writes the sum. Writes nothing if there are only counts of one
     /// successful lambda process, which the shim has written.
-    ///
-    /// # Errors
-    ///
-    /// A failure that names the file.
     pub(crate) fn complete(
         self,
         last: Option<LiveStatus>,

@@ -6,7 +6,9 @@ use std::sync::{Arc, Mutex, PoisonError};
 use gleaner_base::{Exit, Explain, Failure};
 use gleaner_drives::{DriveOptions, Replay, ReplayError};
 use gleaner_messages::Endian;
-use gleaner_transport::{Delivery, DiscoveredTopic, Qos, SampleMeta, Sink, TopicSpec, Transport};
+use gleaner_messages::transport::{
+    Delivery, DiscoveredTopic, Qos, SampleMeta, Sink, TopicSpec, Transport,
+};
 
 use super::images::Decoder;
 use super::{MessageSource, PlayedTopic, Remaps};
@@ -106,40 +108,7 @@ impl Drive {
         };
         begin_at(&mut replay, &args.drives, from_ns);
         let inbox = Arc::new(Inbox { pool: Pool::default(), taken: Mutex::new(None) });
-        let mut remaps = Remaps::of(args);
-        let (mut topics, mut recorded) = (Vec::<PlayedTopic>::new(), Vec::new());
-        for found in wanted(&replay, &args.topics)? {
-            let decoded =
-                args.raw_images && names::dds_type(&found.type_name).as_deref() == Some(COMPRESSED);
-            let to = remaps.take(&found.topic);
-            let topic = play_as(&replay, &found, decoded, to);
-            let spec = TopicSpec {
-                topic: found.topic.clone(),
-                type_name: found.type_name.clone(),
-                queue: 1,
-                max_bytes: usize::MAX,
-                qos: Qos::Auto,
-            };
-            let subscribed = topic.and_then(|topic| {
-                let sink: Arc<dyn Sink> = inbox.clone();
-                replay.subscribe(&spec, sink).map(|_| topic).map_err(|error| error.to_string())
-            });
-            match subscribed {
-                Ok(topic) => {
-                    topics.push(topic);
-                    recorded.push((spec, decoded));
-                }
-                // A topic that was requested by name is never skipped.
-                Err(why) if args.topics.contains(&found.topic) => {
-                    return Err(Failure::new(Exit::Usage, why));
-                }
-                Err(why) => warn(&format!("{why}; the topic is skipped")),
-            }
-        }
-        remaps.check(&topics)?;
-        if topics.is_empty() {
-            return Err(Failure::new(Exit::Usage, "the drive has no topic that can be played"));
-        }
+        let (topics, recorded) = subscribe(&mut replay, args, &inbox)?;
         Ok(Drive {
             paths: args.drives.clone(),
             undecodable: vec![0; topics.len()],
@@ -172,6 +141,49 @@ impl Drive {
         self.rounds += 1;
         Ok(true)
     }
+}
+
+/// Subscribes the topics to play; returns them, and how the drive has them.
+fn subscribe(
+    replay: &mut Replay,
+    args: &Args,
+    inbox: &Arc<Inbox>,
+) -> Result<(Vec<PlayedTopic>, Vec<(TopicSpec, bool)>), Failure> {
+    let mut remaps = Remaps::of(args);
+    let (mut topics, mut recorded) = (Vec::<PlayedTopic>::new(), Vec::new());
+    for found in wanted(replay, &args.topics)? {
+        let decoded =
+            args.raw_images && names::dds_type(&found.type_name).as_deref() == Some(COMPRESSED);
+        let to = remaps.take(&found.topic);
+        let topic = play_as(replay, &found, decoded, to);
+        let spec = TopicSpec {
+            topic: found.topic.clone(),
+            type_name: found.type_name.clone(),
+            queue: 1,
+            max_bytes: usize::MAX,
+            qos: Qos::Auto,
+        };
+        let subscribed = topic.and_then(|topic| {
+            let sink: Arc<dyn Sink> = inbox.clone();
+            replay.subscribe(&spec, sink).map(|_| topic).map_err(|error| error.to_string())
+        });
+        match subscribed {
+            Ok(topic) => {
+                topics.push(topic);
+                recorded.push((spec, decoded));
+            }
+            // A topic that was requested by name is never skipped.
+            Err(why) if args.topics.contains(&found.topic) => {
+                return Err(Failure::new(Exit::Usage, why));
+            }
+            Err(why) => warn(&format!("{why}; the topic is skipped")),
+        }
+    }
+    remaps.check(&topics)?;
+    if topics.is_empty() {
+        return Err(Failure::new(Exit::Usage, "the drive has no topic that can be played"));
+    }
+    Ok((topics, recorded))
 }
 
 /// Begins a replay at this time, with the latched messages that were valid then.

@@ -1,10 +1,10 @@
 //! Converts compressed images into raw ones, and resizes them on request.
 
-use gleaner_image::{ImageError, decode_rgb8, probe_message};
 use gleaner_messages::{
     CdrError, CompressedView, Definitions, Endian, FieldPath, HeaderStamp, MessageValue, Sources,
     header_stamp,
 };
+use gleaner_pixels::{ImageError, decode_rgb8, probe_message};
 
 use crate::args::Size;
 use crate::buffer::{Buffer, Pool};

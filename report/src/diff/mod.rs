@@ -33,9 +33,7 @@ const LISTED_OF_EACH: usize = 20;
 pub struct Diff {
     /// True if no decision differs.
     pub identical: bool,
-    /// The first run.
     pub a: ComparedRun,
-    /// The second run.
     pub b: ComparedRun,
     /// Reasons why the runs are hard to compare, such as different drives.
     pub notes: Vec<String>,

@@ -4,7 +4,7 @@ use gleaner_base::{Exit, Explain};
 use serde_json::{Value, json};
 
 use super::{ChangeCounts, Diff, Difference, ValueChange};
-use crate::page::tests::{Out, START_NS, summary, trigger, wake};
+use crate::tests::{Out, START_NS, summary, trigger, wake};
 
 fn out(decisions: &[Value]) -> Out {
     let out = Out::new();

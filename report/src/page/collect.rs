@@ -16,7 +16,7 @@ use super::model::{Fact, PageClip, PageCurve, PageLogLine, PageRun, PageSpread, 
 use super::pictures::Pictures;
 use crate::format::{clip_contents, clip_span, counted, cut, grouped, seconds, size};
 use crate::results::{JsonLines, ResultsError};
-use crate::run_summary::{OutputError, RunSummary, in_words, shown_config, signals};
+use crate::run_summary::{OutputError, RunSummary, describe, shown_config, signals};
 
 const CLIPS_MAX: usize = 1_000;
 pub(super) const LOG_MAX: usize = 2_000;
@@ -49,20 +49,20 @@ pub(crate) fn collect(
     };
     let start_ns = from_ns.unwrap_or(begin_ns);
 
-    let RunItems { mut events, log, log_seen, clips, clips_seen, thumbnails, last_ns } =
-        RunItems::read(out, start_ns, TEXT_BYTES / shares, &mut notes)?;
+    let mut items = RunItems::read(out, start_ns, TEXT_BYTES / shares, &mut notes)?;
     let mut pictures = Pictures::new(out, start_ns, shares);
-    pictures.at_triggers(
-        &mut events.triggers,
-        signals.as_ref().map_or(&[][..], |signals| &signals.pictures),
-    );
-    pictures.of_clips(&mut events.triggers, &clips, &thumbnails);
+    let of_triggers = signals.as_ref().map_or(&[][..], |signals| &signals.pictures);
+    pictures.at_triggers(&mut items.events.triggers, of_triggers);
+    pictures.of_clips(&mut items.events.triggers, &items.clips, &items.thumbnails);
     notes.extend(pictures.note());
 
     let config = signals.as_ref().map(|signals| shown_config(&signals.config, &mut notes));
     // Notes may quote texts of the files.
     let notes = notes.iter().map(|note| cut(note, NOTE_CHARS)).collect();
     let (name, version, kind) = summary.lambda();
+    let totals = items.totals(pictures.omitted, signals.as_ref());
+    let RunItems { events, log, clips, last_ns, .. } = items;
+    let curves = signals.iter().flat_map(|signals| &signals.curves);
     let mut run = PageRun {
         out: out.display().to_string(),
         lambda: name.to_owned(),
@@ -81,36 +81,16 @@ pub(crate) fn collect(
         stopped: None,
         notes,
         facts: facts(&summary),
-        totals: Totals {
-            triggers: events.triggers_seen,
-            faults: events.faults_seen,
-            unlisted_faults: events.unlisted_faults,
-            clips: clips_seen,
-            pictures_omitted: pictures
-                .omitted
-                .saturating_add(signals.as_ref().map_or(0, |signals| signals.pictures_omitted)),
-            curves_omitted: signals.as_ref().map_or(0, |signals| signals.curves_omitted),
-            log: log_seen,
-        },
-        trigger_density: match events.triggers_seen > events.triggers.len() as u64 {
-            true => events.trigger_density.bins(),
-            false => Vec::new(),
-        },
-        fault_density: match events.faults_seen > events.faults.len() as u64 {
-            true => events.fault_density.bins(),
-            false => Vec::new(),
-        },
+        totals,
+        trigger_density: events.trigger_density.bins_beyond(events.triggers.len()),
+        fault_density: events.fault_density.bins_beyond(events.faults.len()),
         labels: events.labels,
         triggers: events.triggers,
         fault_kinds: events.fault_kinds,
         faults: events.faults,
         fault_causes: events.causes,
         clips,
-        curves: signals
-            .iter()
-            .flat_map(|signals| &signals.curves)
-            .map(|curve| curve_shown(curve, start_ns))
-            .collect(),
+        curves: curves.map(|curve| curve_shown(curve, start_ns)).collect(),
         spreads: spreads(&summary, signals.as_ref()),
         topics: summary.topics(),
         missed: summary.missed(),
@@ -175,6 +155,19 @@ impl RunItems {
         })?;
         Ok(Self { events, log, log_seen, clips, clips_seen, thumbnails, last_ns })
     }
+
+    fn totals(&self, pictures_omitted: u64, signals: Option<&Signals>) -> Totals {
+        let omitted = signals.map_or((0, 0), |it| (it.pictures_omitted, it.curves_omitted));
+        Totals {
+            triggers: self.events.triggers_seen,
+            faults: self.events.faults_seen,
+            unlisted_faults: self.events.unlisted_faults,
+            clips: self.clips_seen,
+            pictures_omitted: pictures_omitted.saturating_add(omitted.0),
+            curves_omitted: omitted.1,
+            log: self.log_seen,
+        }
+    }
 }
 
 fn set_drive(run: &mut PageRun, summary: &RunSummary) {
@@ -217,7 +210,7 @@ fn each<T: DeserializeOwned>(
             return Err(ResultsError::Read { path, source });
         }
         Err(error) => {
-            notes.push(in_words(&error));
+            notes.push(describe(&error));
             return Ok(());
         }
     };
@@ -225,10 +218,10 @@ fn each<T: DeserializeOwned>(
     for line in lines {
         match line {
             Ok(value) => take(value),
-            Err(error @ ResultsError::Read { .. }) => notes.push(in_words(&error)),
+            Err(error @ ResultsError::Read { .. }) => notes.push(describe(&error)),
             Err(error) => {
                 if bad == 0 {
-                    first = in_words(&error);
+                    first = describe(&error);
                 }
                 bad += 1;
             }

@@ -46,7 +46,13 @@ impl Density {
         }
     }
 
-    pub(super) fn bins(&self) -> Vec<DensityBin> {
+    /// Returns the bins if more events were counted than those `shown`.
+    pub(super) fn bins_beyond(&self, shown: usize) -> Vec<DensityBin> {
+        let has_more = self.bins.values().sum::<u64>() > shown as u64;
+        if has_more { self.bins() } else { Vec::new() }
+    }
+
+    fn bins(&self) -> Vec<DensityBin> {
         let seconds = |bin: i64| (i128::from(bin) << self.shift) as f64 / 1e9;
         let dense = |(&(lane, bin), &count): (&(usize, i64), &u64)| DensityBin {
             lane,

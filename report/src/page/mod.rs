@@ -11,7 +11,7 @@ mod html;
 mod model;
 mod pictures;
 #[cfg(test)]
-pub(crate) mod tests;
+mod tests;
 
 use std::path::Path;
 

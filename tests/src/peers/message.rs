@@ -11,12 +11,7 @@ pub enum MessageType {
     /// `sensor_msgs/msg/Imu`, about 330 bytes.
     Imu,
     /// `sensor_msgs/msg/Image`, `rgb8`.
-    Image {
-        /// Columns.
-        width: u32,
-        /// Rows.
-        height: u32,
-    },
+    Image { width: u32, height: u32 },
     /// `sensor_msgs/msg/CompressedImage` with this many bytes.
     CompressedImage(u32),
     /// `sensor_msgs/msg/PointCloud2` with this many bytes, a multiple of 16.
@@ -35,7 +30,6 @@ enum WireValue {
     Bytes(Vec<u8>),
 }
 
-/// A message as a list of values.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PeerMessage(Vec<WireValue>);
 

@@ -46,10 +46,7 @@ pub enum PeerEvent {
         all: bool,
     },
     /// All requested messages were written.
-    Written {
-        /// Their number.
-        count: u32,
-    },
+    Written { count: u32 },
     /// A message was received.
     Sample {
         /// The message's number.
@@ -63,7 +60,6 @@ pub enum PeerEvent {
     Graph {
         /// The participant, in hex.
         gid: String,
-        /// Its nodes.
         nodes: Vec<PeerNode>,
     },
 }
@@ -145,10 +141,6 @@ pub struct Peer {
 
 impl Peer {
     /// Starts it.
-    ///
-    /// # Panics
-    ///
-    /// If the program does not exist; see [`PeerKind::unavailable`].
     pub fn start(mut command: Command) -> Self {
         let mut child =
             command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().expect("a peer starts");
@@ -168,10 +160,6 @@ impl Peer {
     }
 
     /// Waits for the first further event for which `wanted` returns a value.
-    ///
-    /// # Errors
-    ///
-    /// A description, if the peer ends or prints nothing for too long.
     pub fn wait<T>(
         &mut self,
         what: &str,
@@ -202,10 +190,6 @@ impl Peer {
     }
 
     /// Waits until it has written all requested messages.
-    ///
-    /// # Errors
-    ///
-    /// As [`wait`](Self::wait).
     pub fn written(&mut self) -> Result<(), String> {
         self.wait("a peer to write", |event| {
             matches!(event, PeerEvent::Written { .. }).then_some(())
@@ -213,10 +197,6 @@ impl Peer {
     }
 
     /// Waits until it is connected to a peer.
-    ///
-    /// # Errors
-    ///
-    /// As [`wait`](Self::wait).
     pub fn matched(&mut self) -> Result<(), String> {
         self.wait("a peer to be connected", |event| {
             matches!(event, PeerEvent::Matched { count: 1.. }).then_some(())

@@ -5,11 +5,11 @@ use std::net::UdpSocket;
 use std::process::Command;
 
 use gleaner_dds::Dds;
+use gleaner_messages::transport::{LiveSource, Qos, Transport};
+use gleaner_protocol::process_stats::usage;
+use gleaner_test_support::random::XorShift64;
 use gleaner_tests::peers::message::MessageType;
 use gleaner_tests::peers::{PATIENCE, Peer, PeerKind};
-use gleaner_tests::random::XorShift64;
-use gleaner_transport::{LiveSource, Qos, Transport};
-use gleaner_vitals::usage;
 use libtest_mimic::Failed;
 
 use crate::receiver::{TopicReceiver, join};

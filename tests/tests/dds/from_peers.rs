@@ -2,9 +2,9 @@
 
 use std::collections::BTreeSet;
 
+use gleaner_messages::transport::{Qos, Transport};
 use gleaner_tests::peers::message::MessageType;
 use gleaner_tests::peers::{Peer, PeerKind};
-use gleaner_transport::{Qos, Transport};
 use libtest_mimic::Failed;
 
 use crate::receiver::{ReceivedSample, TopicReceiver, join, number};

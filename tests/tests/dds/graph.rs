@@ -1,9 +1,9 @@
 //! Nodes of ROS 2 see the nodes of Gleaner: `ros_discovery_info`, read by a program with one size
 //! of Gid.
 use gleaner_dds::Distro;
+use gleaner_messages::transport::Qos;
 use gleaner_tests::peers::message::MessageType;
 use gleaner_tests::peers::{Peer, PeerEvent, PeerKind, PeerNode};
-use gleaner_transport::Qos;
 use libtest_mimic::Failed;
 
 use crate::receiver::{TopicReceiver, join};

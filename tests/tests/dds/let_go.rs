@@ -3,11 +3,11 @@
 
 use std::time::{Duration, Instant};
 
+use gleaner_messages::transport::{LiveSource, Qos};
 use gleaner_tests::live::{descendants, run, signal};
 use gleaner_tests::peers::message::MessageType::Imu;
 use gleaner_tests::peers::{Peer, PeerEvent, PeerKind};
 use gleaner_tests::{LambdaCopy, TempFolder};
-use gleaner_transport::{LiveSource, Qos};
 use libtest_mimic::Failed;
 
 use crate::receiver::{TopicReceiver, join};

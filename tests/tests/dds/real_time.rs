@@ -6,10 +6,10 @@ use std::process::{Command, Stdio};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
+use gleaner_protocol::process_stats::usage::ProcessUsage;
 use gleaner_tests::live::{PATIENCE, RunningProgram, descendants, run_all, run_by};
 use gleaner_tests::vehicle::TestVehicle;
 use gleaner_tests::{LambdaCopy, TempFolder, program, root};
-use gleaner_vitals::usage::ProcessUsage;
 use libtest_mimic::Failed;
 
 use crate::{DdsCase, Need, case};

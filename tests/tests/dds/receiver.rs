@@ -4,17 +4,16 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
 use gleaner_dds::{Dds, DdsOptions, Distro};
-use gleaner_tests::peers::PATIENCE;
-use gleaner_tests::peers::message::MessageType;
-use gleaner_transport::{
+use gleaner_messages::transport::{
     Delivery, Guid, Qos, ReceptionStatus, SampleMeta, Sink, Subscription, TopicSpec, Transport,
 };
+use gleaner_tests::peers::PATIENCE;
+use gleaner_tests::peers::message::MessageType;
 use libtest_mimic::Failed;
 
 /// The largest message: an image of 1080p.
 const LARGEST: usize = 7 << 20;
 
-/// Joins the domain.
 pub fn join(distro: Option<Distro>) -> Result<Dds, Failed> {
     let mut options = DdsOptions::new("/gleaner/tests");
     options.largest = LARGEST;
@@ -22,7 +21,6 @@ pub fn join(distro: Option<Distro>) -> Result<Dds, Failed> {
     Ok(Dds::open(options)?)
 }
 
-/// A received sample.
 pub struct ReceivedSample {
     pub meta: SampleMeta,
     pub cdr: Vec<u8>,
@@ -50,7 +48,6 @@ pub struct TopicReceiver {
 }
 
 impl TopicReceiver {
-    /// Subscribes.
     pub fn new(dds: &mut Dds, ty: MessageType, topic: &str, qos: Qos) -> Result<Self, Failed> {
         let store = Arc::new(SampleStore::default());
         let (topic, type_name) = (topic.to_owned(), ty.name());

@@ -1,11 +1,10 @@
 //! Builds RTPS packets, valid and broken. Source: OMG DDSI-RTPS 2.3, sections 8.3.7 and 9.4.5.
 
-use gleaner_tests::random::XorShift64;
+use gleaner_test_support::random::XorShift64;
 
 /// Id of an endpoint within a participant.
 pub type Entity = [u8; 4];
 
-/// Any reader.
 pub const ANY: Entity = [0; 4];
 /// The reader of participants' announcements, which every participant has.
 pub const SPDP_READER: Entity = [0, 1, 0, 0xc7];

@@ -6,12 +6,12 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use gleaner_dds::Dds;
+use gleaner_messages::transport::Qos;
 use gleaner_protocol::Report;
 use gleaner_tests::live::{cpu_ns, run, run_all};
 use gleaner_tests::peers::message::MessageType;
 use gleaner_tests::peers::{Peer, PeerEvent, PeerKind};
 use gleaner_tests::{LambdaCopy, TempFolder, root, times};
-use gleaner_transport::Qos;
 use libtest_mimic::Failed;
 
 use crate::faults::{announcement, udp_ports};

@@ -13,10 +13,10 @@ use std::time::{Duration, Instant};
 
 use gleaner_drives::Replay;
 use gleaner_lambda::Clip;
+use gleaner_messages::transport::{Delivery, SampleMeta, Sink, TopicSpec, Transport};
 use gleaner_recorder::RecordingFolder as Clips;
-use gleaner_tests::random::XorShift64;
+use gleaner_test_support::random::XorShift64;
 use gleaner_tests::{LambdaCopy, TempFolder, program, root, runtime, sample_drive, times};
-use gleaner_transport::{Delivery, SampleMeta, Sink, TopicSpec, Transport};
 use libtest_mimic::{Failed, Trial};
 
 use crate::clips::needing;

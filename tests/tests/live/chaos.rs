@@ -11,8 +11,8 @@ use std::time::{Duration, Instant, SystemTime};
 
 use gleaner_lambda::{Clip, Decision};
 use gleaner_protocol::Report;
+use gleaner_test_support::random::XorShift64;
 use gleaner_tests::live::{RunningProgram, decisions, descendants, play, run_all, signal, summary};
-use gleaner_tests::random::XorShift64;
 use gleaner_tests::{LambdaCopy, TempFolder, times, verify_clip};
 
 use super::{clips, wait_for};

@@ -23,7 +23,6 @@ const CASE: &str = "GLEANER_LIVE_CASE";
 
 type LiveCase = (&'static str, fn());
 
-/// Cases with a player.
 const PLAYED: &[LiveCase] = &[
     ("a_drive_played_live_is_decided_as_in_its_replay", as_in_replay::as_in_replay),
     ("a_lambda_slower_than_its_camera_gets_the_newest_frame_and_skips_are_counted", || {

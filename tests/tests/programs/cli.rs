@@ -4,7 +4,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use gleaner_parts::Parts;
+use gleaner_base::programs::InstalledPrograms;
 use gleaner_protocol::ReplaySummary;
 use gleaner_tests::drive::truncated;
 use gleaner_tests::{LambdaCopy, TempFolder, program, root, sample_drive};
@@ -132,7 +132,7 @@ fn on_a_terminal_an_error_is_shown_to_its_last_line() {
     let out = TempFolder::new();
     let typo = ["--set", "brake_mps=-1.4"];
     let (_, plain) = ends_with(USAGE, &mut replay(&hello(), &sample_drive(), &out, &typo));
-    let python = Parts::find().and_then(|parts| parts.python(None)).expect("a Python");
+    let python = InstalledPrograms::find().and_then(|parts| parts.python(None)).expect("a Python");
     // A single run could pass by chance.
     for _ in 0..5 {
         let gleaner = replay(&hello(), &sample_drive(), &out, &typo);

@@ -4,7 +4,7 @@
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use gleaner_parts::Parts;
+use gleaner_base::programs::InstalledPrograms;
 use gleaner_tests::{TempFolder, copy_lambda, program, root, runtime, sample_drive};
 
 /// Actions that `sitecustomize.py` attempts; it prints the name of each and the outcome.
@@ -41,7 +41,9 @@ for name, attempt in TRIES.items():
 fn hostile(folder: &TempFolder) -> PathBuf {
     copy_lambda("tests/lambdas/misbehave/python", folder, "lambda", |manifest| manifest);
     let lambda = folder.path().join("lambda");
-    let python = Parts::find().and_then(|parts| parts.python(None)).expect("Python is installed");
+    let python = InstalledPrograms::find()
+        .and_then(|parts| parts.python(None))
+        .expect("Python is installed");
     let made = Command::new(python)
         .args(["-m", "venv", "--without-pip", ".venv"])
         .current_dir(&lambda)
@@ -108,7 +110,9 @@ fn an_environment_that_is_not_used_is_named_with_the_way_out() {
     let folder = TempFolder::new();
     copy_lambda("tests/lambdas/misbehave/python", &folder, "lambda", |manifest| manifest);
     let lambda = folder.path().join("lambda");
-    let python = Parts::find().and_then(|parts| parts.python(None)).expect("Python is installed");
+    let python = InstalledPrograms::find()
+        .and_then(|parts| parts.python(None))
+        .expect("Python is installed");
     let environment = ["-m", "venv", "--copies", "--without-pip", ".venv"];
     assert!(
         Command::new(python)
@@ -125,7 +129,7 @@ fn an_environment_that_is_not_used_is_named_with_the_way_out() {
         .output()
         .expect("the program starts");
     let stderr = String::from_utf8_lossy(&output.stderr);
-    assert!(stderr.contains("warning: the lambda's environment is not used"), "{stderr}");
+    assert!(stderr.contains("warning: cannot use the lambda's environment"), "{stderr}");
     assert!(
         stderr.contains("create the environment with `python3 -m venv`, which uses links"),
         "{stderr}"

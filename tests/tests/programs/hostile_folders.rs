@@ -7,7 +7,7 @@ use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use gleaner_parts::Parts;
+use gleaner_base::programs::InstalledPrograms;
 use gleaner_tests::{TempFolder, program, root, sample_drive};
 
 const USAGE: i32 = 2;
@@ -201,7 +201,9 @@ fn every_command_names_and_refuses_hostile_files_of_a_build() {
 #[test]
 fn an_environment_with_a_hostile_description_is_refused() {
     let lambda = TestLambda::built();
-    let python = Parts::find().and_then(|parts| parts.python(None)).expect("Python is installed");
+    let python = InstalledPrograms::find()
+        .and_then(|parts| parts.python(None))
+        .expect("Python is installed");
     fs::create_dir_all(lambda.path(".venv/bin")).unwrap();
     symlink(python, lambda.path(".venv/bin/python3")).unwrap();
     for kind in [Pipe, Device, Link, Sparse] {

@@ -12,9 +12,6 @@ use gleaner_tests::live::{
 use gleaner_tests::{LambdaCopy, TempFolder, gleaner, program, replay, root, sample_drive};
 use serde_json::Value;
 
-#[path = "../../../host/inference/tests/suite/onnx.rs"]
-mod onnx;
-
 const DETECTOR: &str = "examples/yolo-detector/rust";
 
 /// Exit code of a run in which a process failed.
@@ -32,7 +29,7 @@ const BOMB: &str = "22bb103fdde8bfe0e9c4ea5770295a6efefafe90b41ca932c9f19a82b56b
 
 /// Returns a model with a constant of 64 GiB, which rten computes when it loads the model.
 fn bomb() -> Vec<u8> {
-    use onnx::{ANY, FLOAT32, INT64, constant, graph, model, node, value};
+    use gleaner_test_support::onnx::{ANY, FLOAT32, INT64, constant, graph, model, node, value};
     let nodes =
         [node("ConstantOfShape", &["n"], &["y0"], &[]), node("Add", &["y0", "x"], &["y"], &[])];
     let side = (1_i64 << 17).to_le_bytes();

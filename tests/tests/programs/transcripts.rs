@@ -6,7 +6,7 @@ use std::os::unix::fs::symlink;
 use std::process::Command;
 use std::time::{Duration, SystemTime};
 
-use gleaner_parts::Parts;
+use gleaner_base::programs::InstalledPrograms;
 use gleaner_tests::drive::{corrupted, truncated};
 use gleaner_tests::transcript::{fits, perform, rewritten, steps};
 use gleaner_tests::{TempFolder, copy_lambda, root, sample_drive};
@@ -136,7 +136,7 @@ fn faulty_lambdas() -> TempFolder {
     drop(truncated(&folder, 0.5));
     drop(corrupted(&folder));
     // An environment as `python -m venv` makes it, without numpy.
-    let python = Parts::find().and_then(|parts| parts.python(None)).expect("a Python");
+    let python = InstalledPrograms::find().and_then(|parts| parts.python(None)).expect("a Python");
     let made = Command::new(python)
         .args(["-m", "venv", "--without-pip", "bare"])
         .current_dir(folder.path())

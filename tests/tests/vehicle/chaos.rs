@@ -10,8 +10,8 @@ use std::thread;
 use std::time::{Duration, Instant, SystemTime};
 
 use gleaner_protocol::vehicle_api::{StreamLine, VehicleStatus};
+use gleaner_test_support::random::XorShift64;
 use gleaner_tests::live::{no_player, play, signal};
-use gleaner_tests::random::XorShift64;
 use gleaner_tests::vehicle::TestVehicle;
 use gleaner_tests::{LambdaCopy, times};
 

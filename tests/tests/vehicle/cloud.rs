@@ -14,7 +14,6 @@ use super::{recording, ticker};
 
 const NAME: &str = "car-7";
 
-/// Starts a vehicle that is enrolled at a cloud.
 fn enrolled() -> (TestCloud, TestVehicle) {
     let cloud = TestCloud::new();
     let mut vehicle = TestVehicle::new();

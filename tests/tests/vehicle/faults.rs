@@ -26,7 +26,7 @@ pub fn probation() {
     vehicle.until_running(&["guard"]);
     let failed = vehicle.deployment("guard");
     let reason = failed.failed.clone().unwrap_or_default();
-    assert!(reason.contains("wakes ended with a fault"), "{failed:?}");
+    assert!(reason.contains("wakes faulted"), "{failed:?}");
     assert_eq!(failed.status.expect("it runs").restarts, 0);
     // The event has the numbers, and the revision is not tried again.
     let rolled_back = events(&vehicle, EventKind::RolledBack);
@@ -52,13 +52,13 @@ pub fn proven() {
     vehicle.until("its probation", |vehicle| vehicle.deployment("guard").is_proven.then_some(()));
     let shown = vehicle.until("a warning", |vehicle| {
         let shown = text(&vehicle.gleaner(&["status"]));
-        shown.contains("wakes ended with a fault").then_some(shown)
+        shown.contains("wakes faulted").then_some(shown)
     });
     let deployment = vehicle.deployment("guard");
     assert!(!deployment.runs_fallback && deployment.failed.is_none(), "{shown}");
     let status = deployment.status.expect("it runs");
     assert_eq!((status.phase, status.restarts), (LambdaPhase::Running, 0), "{shown}");
     let warnings = events(&vehicle, EventKind::Warning);
-    let faults = warnings.iter().filter(|text| text.contains("wakes ended with a fault"));
+    let faults = warnings.iter().filter(|text| text.contains("wakes faulted"));
     assert_eq!(faults.count(), 1, "{warnings:?}");
 }

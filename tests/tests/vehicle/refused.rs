@@ -170,7 +170,7 @@ pub fn memory() {
     metrics.read_to_string(&mut answer).expect("it answers");
     assert!(answer.contains("gleaner_lambda_up{id=\"second\",lambda=\"second\"} 1"), "{answer}");
     let shown = vehicle.succeeds(&["status"]);
-    assert!(shown.contains("memory 608.0 MiB of 64.0 MiB asked for"), "{shown}");
+    assert!(shown.contains("memory: 608.0 MiB reserved of 64.0 MiB allowed"), "{shown}");
 }
 
 pub fn cpu() {

@@ -5,8 +5,8 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use gleaner_base::programs::InstalledPrograms;
 use gleaner_lambda::Decision;
-use gleaner_parts::Parts;
 use gleaner_tests::TempFolder;
 use gleaner_tests::live::signal;
 use gleaner_tests::vehicle::{TestVehicle, text};
@@ -43,7 +43,6 @@ const CODE: &str = "import answer\nfrom pathlib import Path\n\n\nclass Lambda:\n
                     def on_tick(self, ctx):\n        \
                     ctx.event('answer', answer.ANSWER * self.unit)\n";
 
-/// The folder of that lambda, and of its wheels.
 struct LambdaWithWheels {
     folder: TempFolder,
     lock: String,
@@ -67,9 +66,9 @@ impl LambdaWithWheels {
         lambda
     }
 
-    /// Makes a wheel, and locks it.
     fn lock(&mut self, wheel: &str, file: &str, content: &str) {
-        let python = Parts::find().and_then(|parts| parts.python(None)).expect("Python");
+        let python =
+            InstalledPrograms::find().and_then(|parts| parts.python(None)).expect("Python");
         let path = self.folder.path().join("wheels").join(wheel);
         let made = Command::new(python).args(["-c", MAKE]).arg(path).args([file, content]).output();
         let sha256 = String::from_utf8(made.expect("Python starts").stdout).expect("a digest");

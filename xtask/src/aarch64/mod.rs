@@ -63,7 +63,7 @@ pub(crate) fn programs(checkout: &Checkout, others: &[&str]) -> Result<PathBuf, 
 }
 
 fn build(cargo: &mut Command, checkout: &Checkout, others: &[&str]) -> Result<PathBuf, Failure> {
-    cargo.args(["build", "--release", "--target", TARGET]);
+    cargo.args(["build", "--release", "--target", TARGET, setup::SCALED]);
     cargo.args(setup::PROGRAMS.iter().chain(others).flat_map(|package| ["-p", package]));
     steps::run(cargo, "see the first error above")?;
     Ok(checkout.target().join(TARGET).join("release"))

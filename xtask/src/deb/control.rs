@@ -174,7 +174,7 @@ fn is_elf(file: &Path) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::test_folder::TestFolder;
+    use gleaner_test_support::TestFolder;
 
     #[test]
     fn programs_of_packages_get_the_commit_and_whether_files_differ() {

@@ -10,6 +10,7 @@ use super::source::PackageSource;
 use super::tree::PackageTree;
 use crate::checkout::Checkout;
 use crate::metadata::Metadata;
+use crate::setup::SCALED;
 use crate::steps;
 
 /// Writes one file with all crates, and the text of each licence once.
@@ -23,7 +24,7 @@ pub(super) fn write(
     let metadata = Metadata::read(checkout, "--locked")?;
     let mut linked = checkout.cargo();
     linked.args(["tree", "--locked", "--edges=normal", "--prefix=none"]);
-    linked.args(["--format={p}", "--target=all"]);
+    linked.args(["--format={p}", "--target=all", SCALED]);
     let packages = source.cargo_packages.iter().copied().flatten();
     linked.args(packages.flat_map(|package| ["--package", package]));
     let linked = steps::output(&mut linked, help)?;
@@ -78,7 +79,7 @@ fn texts_of(folder: &Path) -> Vec<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::test_folder::TestFolder;
+    use gleaner_test_support::TestFolder;
 
     #[test]
     fn the_licences_of_a_crate_include_those_of_its_sources_in_c() {

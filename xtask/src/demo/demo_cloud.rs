@@ -39,7 +39,7 @@ impl DemoCloud {
         let log = File::create(checkout.path("out/demo/cloud.log")).map_err(failed)?;
         let mut serve = checkout.command(checkout.program("gleaner-cloud"));
         serve.args(["serve", "--data", DATA]);
-        for (option, port) in ["--people", "--vehicles"].into_iter().zip(PORTS) {
+        for (option, port) in ["--http", "--vehicles"].into_iter().zip(PORTS) {
             let free = TcpListener::bind(("127.0.0.1", port)).map_or(0, |_| port);
             serve.arg(option).arg(format!("127.0.0.1:{free}"));
         }

@@ -39,7 +39,6 @@ pub(super) struct DemoVehicle<'c> {
     /// Folder of the sockets.
     run: PathBuf,
     orchestrator: Option<Child>,
-    /// True if it has a cloud, in which it is enrolled.
     pub(super) has_cloud: bool,
     /// Set by SIGTERM: the demo is to end.
     ends: Arc<AtomicBool>,

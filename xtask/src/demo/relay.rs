@@ -78,7 +78,7 @@ fn copy(mut from: UnixStream, mut to: UnixStream) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::test_folder::TestFolder;
+    use gleaner_test_support::TestFolder;
 
     #[test]
     fn a_connection_crosses_both_relays_and_ends_in_each_direction() {

@@ -89,7 +89,7 @@ mod tests {
     use std::process::Command;
 
     use super::*;
-    use crate::test_folder::TestFolder;
+    use gleaner_test_support::TestFolder;
 
     /// Texts of the program's source after `call("`, up to the next quotation mark.
     fn arguments(folder: &Path, call: &str, found: &mut BTreeSet<String>) {

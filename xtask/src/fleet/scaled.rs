@@ -77,7 +77,7 @@ impl ScaledCloud {
             replica.arg("serve").arg("--data").arg(&data);
             replica.args(["--store", &format!("postgres://nobody@{database}/postgres")]);
             replica.args(["--bus", &format!("nats://{bus}"), "--objects", "s3://gleaner"]);
-            replica.args(["--people", &people_of.to_string()]);
+            replica.args(["--http", &people_of.to_string()]);
             replica.args(["--vehicles", &vehicles_of.to_string()]);
             replica.args(["--name", &vehicles.to_string()]);
             replica.env("AWS_ENDPOINT_URL", format!("http://{store}"));

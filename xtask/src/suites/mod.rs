@@ -70,7 +70,7 @@ struct EndedSuite {
 
 /// Tests that read files in the folder of `GLEANER_SHARED`, and those of the pages, as packages
 /// with their test programs. A test compares the list with the sources.
-const READ_SHARED: &str = "binary(drives) | binary(house) | binary(vision) \
+const READ_SHARED: &str = "binary(drives) | binary(architecture) | package(gleaner-pixels) & binary(vision) \
                            | package(gleaner-inference) & binary(suite) | package(imu-fft)";
 
 /// Sets up and runs all tests, or with `--shared` those of [`READ_SHARED`]. The last line is
@@ -84,7 +84,7 @@ fn run_shared(checkout: &Checkout) -> Result<Exit, Failure> {
     let mut suites = if has_nextest(checkout) {
         vec![nextest(checkout, &["-E", READ_SHARED])]
     } else {
-        let programs = ["--test", "drives", "--test", "house", "--test", "vision"];
+        let programs = ["--test", "drives", "--test", "architecture", "--test", "vision"];
         let tests = cargo_test(checkout, &[&programs[..], &["--test", "suite", "--lib"]].concat());
         vec![suite("cargo test", tests, SuiteResults::Libtest)]
     };

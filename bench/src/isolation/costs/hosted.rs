@@ -9,10 +9,10 @@ use gleaner_host::guest::Guest;
 use gleaner_host::guest::wasm::{Loaded, WasmGuest};
 use gleaner_host::input::open_inputs;
 use gleaner_lambda::manifest::{ConfigValue, Limits, Manifest};
+use gleaner_messages::transport::loopback::Loopback;
+use gleaner_messages::transport::{Guid, SampleMeta};
 use gleaner_tests::drive::{IMAGE, TopicMessages};
 use gleaner_tests::root;
-use gleaner_transport::loopback::Loopback;
-use gleaner_transport::{Guid, SampleMeta};
 
 use super::drives;
 

@@ -11,9 +11,6 @@ mod faults;
 mod hosted;
 mod live;
 mod native;
-/// The arithmetic of the example, compiled natively.
-#[path = "../../../../examples/imu-fft/rust/src/road.rs"]
-mod road;
 mod sides;
 mod wakes;
 

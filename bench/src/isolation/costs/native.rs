@@ -15,8 +15,7 @@ use gleaner_lambda::manifest::ConfigValue;
 use gleaner_lambda::{Fault, FaultKind};
 use gleaner_sdk::kernels::fft::SpectrumError;
 use gleaner_sdk::kernels::mean::mean;
-
-use super::road::{Road, Roughness};
+use imu_fft::road::{Road, Roughness};
 
 /// As in `examples/brake-dark`.
 const WINDOW_NS: i64 = 500_000_000;

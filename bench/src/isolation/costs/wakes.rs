@@ -9,9 +9,9 @@ use gleaner_bench_results::{
 use gleaner_lambda::{Decision, twins_differ};
 use gleaner_tests::drive::{TopicMessages, of_topics};
 use gleaner_tests::{LambdaCopy, TempFolder};
+use imu_fft::road::Road;
 
 use super::drives::{self, CAMERA, IMU};
-use super::road::Road;
 use super::sides::{WakeSide, WakeTurn};
 use crate::measure::{Twin, median, shuffled};
 use crate::rtt::Workload;

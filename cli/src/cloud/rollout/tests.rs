@@ -48,18 +48,18 @@ fn a_vehicle_is_done_once_it_runs_the_new_revision() {
     let done = Standing::Done("runs 0.2.0".to_owned());
     assert_eq!(judge(NEW, json!({ "status": lambda("running", 5) })), done);
     for (fields, reason) in [
-        (json!({}), "it has not confirmed a start yet"),
-        (json!({ "status": lambda("running", 4) }), "it has not confirmed a start yet"),
+        (json!({}), "has not confirmed the start yet"),
+        (json!({ "status": lambda("running", 4) }), "has not confirmed the start yet"),
         (json!({ "status": lambda("starting", 5) }), "its lambda is starting"),
         (
             json!({ "envelope": "other", "status": lambda("running", 5) }),
-            "it has another deployment, with release 2",
+            "has another deployment, with release 2",
         ),
     ] {
         assert_eq!(judge(NEW, fields), Standing::Pending(reason.to_owned()));
     }
     let absent = rollout(NEW).judge(NEW, &status(&[]), &[]);
-    assert_eq!(absent, Standing::Pending("it does not have the deployment yet".to_owned()));
+    assert_eq!(absent, Standing::Pending("does not have the deployment yet".to_owned()));
 }
 
 #[test]
@@ -70,20 +70,20 @@ fn a_vehicle_that_will_not_run_the_new_revision_has_failed_with_the_reason() {
     running["recent"] = json!({ "wakes": 20, "faults": 20, "backed_off": 0 });
     assert!(judge(NEW, json!({ "status": running })).is_done(), "after its probation");
     let faulty = json!({ "is_proven": false, "fallback": null, "status": running });
-    let reason = "it runs 0.2.0, but 20 of its last 20 wakes ended with a fault";
+    let reason = "runs 0.2.0, but 20 of its last 20 wakes faulted";
     for (fields, exit, reason) in [
         (faulty, Exit::LambdaFaulted, reason),
-        (json!({ "refused": "no key" }), Exit::Denied, "it refuses it: no key"),
-        (fallback, Exit::LambdaFaulted, "it runs its fallback 0.1.0: it faults"),
+        (json!({ "refused": "no key" }), Exit::Denied, "refused: no key"),
+        (fallback, Exit::LambdaFaulted, "runs its fallback 0.1.0: it faults"),
         (
             json!({ "release": 3, "envelope": "other" }),
             Exit::Differs,
-            "it has another deployment, with release 3",
+            "has another deployment, with release 3",
         ),
         (
             json!({ "status": lambda("quarantined", 5) }),
             Exit::LambdaFaulted,
-            "it does not run, and is not started again: exit code 1",
+            "does not run, and is not restarted: exit code 1",
         ),
     ] {
         assert_eq!(judge(NEW, fields), Standing::Failed(exit, reason.to_owned()));
@@ -101,7 +101,7 @@ fn a_vehicle_that_will_not_run_the_new_revision_has_failed_with_the_reason() {
     assert_eq!(judge(problem("brake", "e2", true)), Standing::Pending("no key".to_owned()));
     // Of another deployment, and of an earlier one of this id.
     for (id, envelope) in [("other", "e2"), ("brake", "e1")] {
-        let absent = Standing::Pending("it does not have the deployment yet".to_owned());
+        let absent = Standing::Pending("does not have the deployment yet".to_owned());
         assert_eq!(judge(problem(id, envelope, false)), absent);
     }
     // Another deployment with the same number, and the refusal of this one.
@@ -117,11 +117,12 @@ fn a_rollback_waits_for_the_fallback_and_a_start_for_either() {
     assert!(judge(Goal::Fallback, fallback()).is_done());
     assert!(judge(Goal::Running, fallback()).is_done());
     assert!(judge(Goal::Running, own()).is_done());
-    assert_eq!(judge(Goal::Fallback, own()), Standing::Pending("it runs its revision".to_owned()));
+    assert_eq!(judge(Goal::Fallback, own()), Standing::Pending("runs its revision".to_owned()));
     let none = judge(Goal::Fallback, json!({ "fallback": null }));
-    assert_eq!(none, Standing::Failed(Exit::Differs, "it has no fallback".to_owned()));
+    let kept = "keeps release 2, which has no fallback".to_owned();
+    assert_eq!(none, Standing::Failed(Exit::Differs, kept));
     let stopped = judge(Goal::Running, json!({ "is_wanted": false }));
-    assert_eq!(stopped, Standing::Pending("it is stopped".to_owned()));
+    assert_eq!(stopped, Standing::Pending("is stopped".to_owned()));
 }
 
 #[test]
@@ -136,12 +137,12 @@ fn a_stop_and_a_removal_wait_for_the_end_of_the_lambda() {
     for (goal, applied) in [(Goal::Stopped, stopped()), (Goal::Removed, status(&[]))] {
         assert!(judge(goal, supervised(applied.clone(), json!([]))).is_done());
         let still = judge(goal, supervised(applied.clone(), ends.clone()));
-        assert_eq!(still, Standing::Pending("its lambda still ends".to_owned()));
+        assert_eq!(still, Standing::Pending("its lambda is still stopping".to_owned()));
         let unknown = judge(goal, applied);
         assert_eq!(unknown, Standing::Pending("its supervisor does not report".to_owned()));
     }
     let judged = judge(Goal::Removed, supervised(stopped(), json!([])));
-    assert_eq!(judged, Standing::Pending("it has not followed the change yet".to_owned()));
+    assert_eq!(judged, Standing::Pending("has not applied the change yet".to_owned()));
 }
 
 fn supervisor() -> SupervisorStatus {
@@ -154,7 +155,7 @@ fn supervisor() -> SupervisorStatus {
 
 #[test]
 fn the_error_has_the_reason_of_each_vehicle_and_the_worst_exit_code() {
-    let pending = || Standing::Pending("it is offline".to_owned());
+    let pending = || Standing::Pending("offline".to_owned());
     let failed = |exit| Standing::Failed(exit, "bad".to_owned());
     let exit = |others: &[Standing]| {
         let all = others.iter().enumerate().map(|(n, it)| (format!("car-{n}"), it.clone()));
@@ -163,7 +164,7 @@ fn the_error_has_the_reason_of_each_vehicle_and_the_worst_exit_code() {
     let failure = exit(&[pending(), failed(Exit::LambdaFaulted)]);
     assert_eq!(failure.exit, Exit::LambdaFaulted);
     assert_eq!(failure.message, "`brake` runs on 1 of 3 vehicles");
-    assert_eq!(failure.causes, ["car-0: it is offline", "car-1: bad"]);
+    assert_eq!(failure.causes, ["car-0: offline", "car-1: bad"]);
     assert_eq!(exit(&[pending()]).exit, Exit::Differs);
     assert_eq!(exit(&[failed(Exit::LambdaFaulted), failed(Exit::Denied)]).exit, Exit::Denied);
     let many = exit(&vec![pending(); SHOWN + 3]);

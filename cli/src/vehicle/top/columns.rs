@@ -6,7 +6,7 @@ use gleaner_base::visible;
 use gleaner_report::format::{grouped, size};
 
 use super::super::status::{NO_DEPLOYMENTS, shared};
-use super::figures::{LambdaFigures, ProgramFigures, VehicleFigures};
+use super::metrics::{LambdaMetrics, ProgramMetrics, VehicleMetrics};
 use crate::render::{or_dash, table};
 
 /// Spaces between two columns, as in [`table`].
@@ -14,7 +14,7 @@ pub(super) const GAP: usize = 2;
 
 pub(super) struct Column {
     pub(super) head: &'static str,
-    pub(super) cell: fn(&LambdaFigures) -> String,
+    pub(super) cell: fn(&LambdaMetrics) -> String,
     /// Place in the order in which columns are given room: 0 is the first.
     rank: u8,
 }
@@ -44,7 +44,7 @@ impl Column {
     }
 
     /// Returns the number of characters of its longest cell.
-    pub(super) fn width(&self, lambdas: &[LambdaFigures]) -> usize {
+    pub(super) fn width(&self, lambdas: &[LambdaMetrics]) -> usize {
         let cells = lambdas.iter().map(|it| (self.cell)(it).chars().count());
         cells.chain([self.head.len()]).max().unwrap_or(0)
     }
@@ -52,7 +52,7 @@ impl Column {
 
 /// Returns the columns that fit into `width` characters, with the width of each.
 pub(super) fn fitting(
-    lambdas: &[LambdaFigures],
+    lambdas: &[LambdaMetrics],
     width: usize,
 ) -> impl Iterator<Item = (&'static Column, usize)> {
     let mut ranked: Vec<_> = COLUMNS.iter().map(|it| (it.rank, it.width(lambdas) + GAP)).collect();
@@ -69,19 +69,19 @@ pub(super) fn fitting(
 }
 
 /// Formats all figures as text, with the columns that fit into `width` characters.
-pub(super) fn text(figures: &VehicleFigures, width: usize) -> String {
-    let mut text: String = head(figures, width).iter().map(|line| format!("{line}\n")).collect();
+pub(super) fn text(metrics: &VehicleMetrics, width: usize) -> String {
+    let mut text: String = head(metrics, width).iter().map(|line| format!("{line}\n")).collect();
     text += "\n";
-    if figures.lambdas.is_empty() {
+    if metrics.lambdas.is_empty() {
         return text + NO_DEPLOYMENTS + "\n";
     }
-    let columns: Vec<_> = fitting(&figures.lambdas, width).map(|(column, _)| column).collect();
+    let columns: Vec<_> = fitting(&metrics.lambdas, width).map(|(column, _)| column).collect();
     let head: Vec<_> = columns.iter().map(|column| column.head).collect();
     let cells =
-        |lambda: &LambdaFigures| columns.iter().map(|it| (it.cell)(lambda)).collect::<Vec<_>>();
+        |lambda: &LambdaMetrics| columns.iter().map(|it| (it.cell)(lambda)).collect::<Vec<_>>();
     let numbers: Vec<_> = (0..head.len()).filter(|index| columns[*index].is_number()).collect();
-    text += &table(&head, figures.lambdas.iter().map(cells), &numbers);
-    for lambda in &figures.lambdas {
+    text += &table(&head, metrics.lambdas.iter().map(cells), &numbers);
+    for lambda in &metrics.lambdas {
         for reason in &lambda.reasons {
             text += &format!("{}: {reason}\n", visible(&lambda.id));
         }
@@ -90,17 +90,17 @@ pub(super) fn text(figures: &VehicleFigures, width: usize) -> String {
 }
 
 /// Returns the lines on the vehicle as a whole, of at most `width` characters.
-pub(super) fn head(figures: &VehicleFigures, width: usize) -> Vec<String> {
-    let trust = match &figures.trust {
+pub(super) fn head(metrics: &VehicleMetrics, width: usize) -> Vec<String> {
+    let trust = match &metrics.trust {
         None => "no trust root".to_owned(),
         Some(trust) if trust.is_expired => format!("trust root {} has expired", trust.version),
         Some(trust) => format!("trust root {}", trust.version),
     };
-    let supervisor = match &figures.supervisor {
+    let supervisor = match &metrics.supervisor {
         None => "the supervisor does not run".to_owned(),
         Some(supervisor) => format!("supervisor {}", program(supervisor)),
     };
-    let services = figures.services.iter().map(|service| {
+    let services = metrics.services.iter().map(|service| {
         let state = if service.is_ready { "" } else { " not ready" };
         let memory = service.rss_bytes.map(|it| format!(" {}", size(it))).unwrap_or_default();
         let restarts = match service.restarts {
@@ -109,10 +109,10 @@ pub(super) fn head(figures: &VehicleFigures, width: usize) -> Vec<String> {
         };
         format!("{}{state}{memory}{restarts}", service.name)
     });
-    let capacity = figures.capacity.iter().map(shared);
-    let age = figures.age_s.map(|age_s| format!("as of {age_s:.0} s ago"));
-    let vehicle = [visible(&figures.vehicle), trust].into_iter().chain(age);
-    let programs = [format!("orchestrator {}", program(&figures.orchestrator)), supervisor];
+    let capacity = metrics.capacity.iter().map(shared);
+    let age = metrics.age_s.map(|age_s| format!("as of {age_s:.0} s ago"));
+    let vehicle = [visible(&metrics.vehicle), trust].into_iter().chain(age);
+    let programs = [format!("orchestrator {}", program(&metrics.orchestrator)), supervisor];
     let mut lines = wrapped(vehicle, width);
     lines.extend(wrapped(programs, width));
     lines.extend(wrapped(services, width));
@@ -134,7 +134,7 @@ fn wrapped(parts: impl IntoIterator<Item = String>, width: usize) -> Vec<String>
     lines
 }
 
-fn program(program: &ProgramFigures) -> String {
+fn program(program: &ProgramMetrics) -> String {
     format!("CPU {} %, {}", decimal(program.cpu_percent), size(program.rss_bytes))
 }
 
@@ -158,7 +158,7 @@ pub(super) enum RowOrder {
 }
 
 /// An order, with the head and the number of its column.
-type OrderColumn = (RowOrder, &'static str, fn(&LambdaFigures) -> Option<f64>);
+type OrderColumn = (RowOrder, &'static str, fn(&LambdaMetrics) -> Option<f64>);
 
 impl RowOrder {
     /// All of them as they are declared: `self as usize` is the index.
@@ -180,7 +180,7 @@ impl RowOrder {
     }
 
     /// Sorts rows: ids from A to Z, numbers from the highest down, unknown ones last.
-    pub(super) fn sort(self, lambdas: &mut [LambdaFigures]) {
+    pub(super) fn sort(self, lambdas: &mut [LambdaMetrics]) {
         let number = Self::ALL[self as usize].2;
         lambdas.sort_by(|a, b| {
             let [one, other] = [a, b].map(|it| number(it).unwrap_or(f64::NEG_INFINITY));

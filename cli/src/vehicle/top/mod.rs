@@ -1,11 +1,11 @@
 //! `gleaner top`: the cost of each lambda of a vehicle, about each second.
 //!
-//! - `figures`: rates and sums of a status, compared with earlier ones. It does no I/O.
+//! - `metrics`: rates and sums of a status, compared with earlier ones. It does no I/O.
 //! - `columns`: the table of the lambdas. `page`: the page of a terminal, with it.
 //! - `screen`: the terminal, keys and signals.
 
 mod columns;
-mod figures;
+mod metrics;
 mod page;
 mod screen;
 
@@ -22,7 +22,7 @@ use serde_json::json;
 use super::client::VehicleClient;
 use crate::args::TopArgs;
 use crate::output::{end_with_reader, print_json, show};
-use figures::VehicleFigures;
+use metrics::VehicleMetrics;
 
 /// Time from a poll to the next. The processes report their counts as often.
 const POLL_INTERVAL: Duration = Duration::from_secs(1);
@@ -44,8 +44,8 @@ pub(crate) fn top(args: &TopArgs) -> Result<Exit, Failure> {
     polls.add(client.status()?);
     match (args.once, args.source.vehicle.json) {
         (true, json) => {
-            let figures = once(&client, &mut polls)?;
-            show(json, &figures, |figures| columns::text(figures, width()))
+            let metrics = once(&client, &mut polls)?;
+            show(json, &metrics, |metrics| columns::text(metrics, width()))
         }
         (false, true) => follow(&client, &mut polls),
         (false, false) => screen::run(client, polls),
@@ -67,22 +67,22 @@ impl Polls {
     }
 
     /// Returns the figures of the newest status.
-    fn figures(&self) -> VehicleFigures {
+    fn metrics(&self) -> VehicleMetrics {
         let mut polls = self.0.iter();
         let newest = polls.next().expect("the first poll is added before this");
-        VehicleFigures::of(newest, polls)
+        VehicleMetrics::of(newest, polls)
     }
 }
 
 /// Returns figures with rates: after the second poll, or up to two later if a lambda that runs has
 /// not reported in between.
-fn once(client: &VehicleClient, polls: &mut Polls) -> Result<VehicleFigures, Failure> {
+fn once(client: &VehicleClient, polls: &mut Polls) -> Result<VehicleMetrics, Failure> {
     loop {
         thread::sleep(POLL_INTERVAL);
         polls.add(client.status()?);
-        let figures = polls.figures();
-        if polls.0.len() == POLLS_KEPT || figures.are_complete() {
-            return Ok(figures);
+        let metrics = polls.metrics();
+        if polls.0.len() == POLLS_KEPT || metrics.are_complete() {
+            return Ok(metrics);
         }
     }
 }
@@ -96,14 +96,14 @@ fn width() -> usize {
 /// Prints an object for each poll, until its reader closes the pipe.
 fn follow(client: &VehicleClient, polls: &mut Polls) -> Result<Exit, Failure> {
     let mut answered = Instant::now();
-    let mut line = json!(polls.figures());
+    let mut line = json!(polls.metrics());
     while print_json(&line)? {
         thread::sleep(POLL_INTERVAL);
         line = match client.status() {
             Ok(status) => {
                 answered = Instant::now();
                 polls.add(status);
-                json!(polls.figures())
+                json!(polls.metrics())
             }
             Err(failure) => {
                 let for_s = answered.elapsed().as_secs_f64();

@@ -14,7 +14,7 @@ use ratatui::widgets::{Block, Borders, Paragraph, Row, Table, TableState, Wrap};
 
 use super::super::status::NO_DEPLOYMENTS;
 use super::columns::{self, RowOrder};
-use super::figures::{LambdaFigures, losses};
+use super::metrics::{LambdaMetrics, losses};
 use super::{POLL_INTERVAL, Polls};
 use crate::render::{in_ms, isolation, table};
 
@@ -52,24 +52,24 @@ impl Page {
             lambdas.get(row.min(lambdas.len().saturating_sub(1))).map(|it| it.id.clone());
     }
 
-    fn lambdas(&self) -> Vec<LambdaFigures> {
-        let mut lambdas = self.polls.figures().lambdas;
+    fn lambdas(&self) -> Vec<LambdaMetrics> {
+        let mut lambdas = self.polls.metrics().lambdas;
         self.order.sort(&mut lambdas);
         lambdas
     }
 
     /// Returns the number of the selected row; the first without one, or if it is gone.
-    fn row(&self, lambdas: &[LambdaFigures]) -> usize {
+    fn row(&self, lambdas: &[LambdaMetrics]) -> usize {
         lambdas.iter().position(|it| Some(&it.id) == self.selected.as_ref()).unwrap_or(0)
     }
 
     /// Draws everything. `silent` is the time since the last answer of the orchestrator.
     pub(super) fn draw(&mut self, frame: &mut Frame, silent: Duration) {
         let Some(status) = self.polls.newest() else { return };
-        let mut figures = self.polls.figures();
-        self.order.sort(&mut figures.lambdas);
-        let lambdas = figures.lambdas.as_slice();
-        let mut head: Vec<Line> = columns::head(&figures, usize::from(frame.area().width))
+        let mut metrics = self.polls.metrics();
+        self.order.sort(&mut metrics.lambdas);
+        let lambdas = metrics.lambdas.as_slice();
+        let mut head: Vec<Line> = columns::head(&metrics, usize::from(frame.area().width))
             .into_iter()
             .map(Line::from)
             .collect();
@@ -139,7 +139,7 @@ fn areas(area: Rect, head: usize, rows: usize) -> [Rect; 4] {
     .areas(area)
 }
 
-fn style(lambda: &LambdaFigures) -> Style {
+fn style(lambda: &LambdaMetrics) -> Style {
     match lambda.state {
         "quarantined" => Style::new().fg(Color::Red),
         "running" | "on probation" => Style::new(),
@@ -148,7 +148,7 @@ fn style(lambda: &LambdaFigures) -> Style {
 }
 
 /// Returns the details of a lambda, the most important ones first.
-fn details(lambda: &LambdaFigures, deployment: &DeploymentStatus) -> Vec<Line<'static>> {
+fn details(lambda: &LambdaMetrics, deployment: &DeploymentStatus) -> Vec<Line<'static>> {
     let status = deployment.status.as_ref();
     let mut title = format!("{} {}, {}", visible(&lambda.lambda), lambda.version, lambda.state);
     if let Some(status) = status {

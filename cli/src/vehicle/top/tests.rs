@@ -6,7 +6,7 @@ use ratatui::backend::TestBackend;
 use serde_json::{Value, json};
 
 use super::columns::{self, RowOrder};
-use super::figures::{VehicleFigures, losses};
+use super::metrics::{VehicleMetrics, losses};
 use super::page::Page;
 use super::{POLLS_KEPT, Polls};
 
@@ -69,16 +69,16 @@ fn status(value: Value) -> VehicleStatus {
 }
 
 /// Figures by these statuses of one lambda, the newest first.
-fn figures(deployments: Vec<Value>) -> VehicleFigures {
+fn metrics(deployments: Vec<Value>) -> VehicleMetrics {
     let count = deployments.len();
     let with_time = |(index, it)| status(vehicle((count - index) as f64, vec![it]));
     let polls: Vec<_> = deployments.into_iter().enumerate().map(with_time).collect();
-    VehicleFigures::of(&polls[0], polls[1..].iter())
+    VehicleMetrics::of(&polls[0], polls[1..].iter())
 }
 
 /// Rates of these statuses of one lambda: wakes in 1 s, and percent of a core.
 fn rates(deployments: Vec<Value>) -> (Option<f64>, Option<f64>) {
-    let lambda = figures(deployments).lambdas.remove(0);
+    let lambda = metrics(deployments).lambdas.remove(0);
     (lambda.wakes_per_s, lambda.cpu_percent)
 }
 
@@ -96,7 +96,7 @@ fn a_rate_is_the_growth_between_two_reports_of_a_process() {
     assert_eq!(rates(unchanged), (Some(10.0), Some(25.0)));
     assert_eq!(rates(vec![second.clone(), second.clone()]), (None, None));
     assert_eq!(rates(vec![second.clone()]), (None, None));
-    let all = figures(vec![second, first]);
+    let all = metrics(vec![second, first]);
     assert!((all.orchestrator.cpu_percent.unwrap() - 10.0).abs() < 1e-9, "{all:?}");
     assert!((all.supervisor.unwrap().cpu_percent.unwrap() - 10.0).abs() < 1e-9);
 }
@@ -121,8 +121,8 @@ fn another_process_has_no_rate_until_its_second_report() {
 
 #[test]
 fn losses_of_all_causes_are_added() {
-    let figures = figures(vec![deployment("a", 2.0, 1, 0.1)]);
-    assert_eq!(figures.lambdas[0].losses, Some(3 + 1 + 5 + 4));
+    let metrics = metrics(vec![deployment("a", 2.0, 1, 0.1)]);
+    assert_eq!(metrics.lambdas[0].losses, Some(3 + 1 + 5 + 4));
     let status = status(vehicle(1.0, vec![deployment("a", 2.0, 1, 0.1)]));
     let live = status.deployments[0].status.as_ref().unwrap().live.as_ref().unwrap();
     let causes: Vec<_> = losses(live).into_iter().map(|(_, what)| what).collect();
@@ -139,7 +139,7 @@ fn losses_of_all_causes_are_added() {
 
 #[test]
 fn the_json_has_rates_and_unknown_ones_are_null() {
-    let json = serde_json::to_value(figures(vec![deployment("hello", 2.0, 1, 0.1)])).unwrap();
+    let json = serde_json::to_value(metrics(vec![deployment("hello", 2.0, 1, 0.1)])).unwrap();
     assert_eq!(json["lambdas"][0]["wakes_per_s"], Value::Null);
     assert_eq!(json["lambdas"][0]["clips"], 3);
     assert_eq!(json["lambdas"][0]["clip_bytes"], 2048);
@@ -156,7 +156,7 @@ fn rows_are_sorted_by_the_highest_number_and_unknown_ones_come_last() {
         ];
         let before = vec![deployment("b", 2.0, 0, 0.0), deployment("a", 2.0, 0, 0.5)];
         let [now, before] = [lambdas, before].map(|it| status(vehicle(1.0, it)));
-        let mut lambdas = VehicleFigures::of(&now, [before].iter()).lambdas;
+        let mut lambdas = VehicleMetrics::of(&now, [before].iter()).lambdas;
         order.sort(&mut lambdas);
         lambdas.into_iter().map(|it| it.id).collect::<String>()
     };
@@ -197,7 +197,7 @@ fn a_wide_page_shows_all_columns() {
             "car-7   trust root 3",
             "orchestrator CPU 10.0 %, 8.6 MiB   supervisor CPU 10.0 %, 3.8 MiB",
             "ingress, restarts 2",
-            "memory 1.0 MiB of 8.0 MiB asked for   cpu 0.50 cores of 2.00 cores asked for",
+            "memory: 1.0 MiB reserved of 8.0 MiB allowed   cpu: 0.50 cores reserved of 2.00 cores allowed",
             "",
             concat!(
                 "id      state    wakes/s  p50 ms  p99 ms  run p99  CPU %    memory  lost  faults",
@@ -230,7 +230,7 @@ fn a_wide_page_shows_all_columns() {
 fn a_narrow_page_has_the_columns_that_fit_and_the_details() {
     let lines = drawn(&mut page(two), 80, 24, 0);
     assert_eq!(
-        lines[5..7],
+        lines[6..8],
         [
             "id      state    wakes/s  p99 ms  CPU %    memory  lost  faults  restarts",
             "hello   running    100.0    1.50   25.0  20.0 MiB    13       1         0",
@@ -265,7 +265,7 @@ fn the_reason_of_a_quarantine_is_shown_without_control_characters() {
         vec![changed(lambda, "/status/last_end", json!("killed \u{1b}[2Jby SIGKILL"))]
     });
     let lines = drawn(&mut page, 80, 24, 0);
-    assert!(lines[6].starts_with("hello  quarantined        -"), "{lines:#?}");
+    assert!(lines[7].starts_with("hello  quarantined        -"), "{lines:#?}");
     assert!(lines.iter().any(|it| it == r"last end: killed \u{1b}[2Jby SIGKILL"), "{lines:#?}");
 }
 
@@ -275,7 +275,7 @@ fn a_lost_connection_is_shown_until_the_next_answer() {
     page.add(Err("cannot reach gleaner-orchestrator".to_owned()));
     let lines = drawn(&mut page, 80, 24, 65);
     assert_eq!(lines[0], "no connection for 65s: cannot reach gleaner-orchestrator");
-    assert!(lines[7].starts_with("hello   running"), "the last figures stay: {lines:#?}");
+    assert!(lines[8].starts_with("hello   running"), "the last figures stay: {lines:#?}");
     page.add(Ok(status(vehicle(12.0, two(12.0)))));
     assert!(drawn(&mut page, 80, 24, 0)[0].starts_with("car-7"));
     // One that is stopped answers with nothing.
@@ -292,7 +292,7 @@ fn a_vehicle_without_deployments_shows_that() {
 fn text_has_every_column_and_the_reasons() {
     let lambda = deployment("hello", 2.0, 100, 1.0);
     let text =
-        columns::text(&figures(vec![changed(lambda, "/refused", json!("unsigned"))]), usize::MAX);
+        columns::text(&metrics(vec![changed(lambda, "/refused", json!("unsigned"))]), usize::MAX);
     assert!(text.contains("id     state    wakes/s  p50 ms"), "{text}");
     assert!(text.contains("hello  running        -    0.25"), "{text}");
     assert!(text.ends_with("hello: refused: unsigned\n"), "{text}");

@@ -306,7 +306,7 @@ fn a_change_that_takes_something_away_is_asked_for() {
     user.statuses("car-8", &[on_vehicle(7, "running")]);
     let accepted = [&moved[..], &["--yes"]].concat();
     let text = user.fails(4, &[&accepted[..], &["--timeout", "1ms"]].concat());
-    assert!(text.contains("car-7: it has not followed the change yet"), "{text}");
+    assert!(text.contains("car-7: has not applied the change yet"), "{text}");
     user.cloud.answers("GET /v1/vehicles/car-7/status", &[ended(&[])]);
     assert!(user.done(&accepted).contains("car-7: is removed\n"));
 }
@@ -325,7 +325,7 @@ fn the_error_of_a_fleet_names_each_vehicle_and_its_reason() {
     let arguments = [&DEPLOY[..], &["--timeout", "1ms", "--release", "1"]].concat();
     let text = user.fails(6, &arguments);
     assert!(text.starts_with("error: `brake` runs on 1 of 3 vehicles\n"), "{text}");
-    for part in ["car-8: it does not run, and", "exit code 1", "car-9: it is offline, seen "] {
+    for part in ["car-8: does not run, and", "exit code 1", "car-9: offline, seen "] {
         assert!(text.contains(part), "{text}");
     }
     user.statuses("car-8", &[on_vehicle(1, "starting")]);
@@ -340,7 +340,7 @@ fn a_deployment_without_a_vehicle_yet_is_no_error() {
     let text = user.fails(4, &[&DEPLOY[..], &["--label", "site=berln"]].concat());
     assert!(text.contains("no vehicle matches") && text.contains("site=berln"), "{text}");
     let text = user.done(&[&DEPLOY[..], &["--label", "site=berlin", "--yes"]].concat());
-    assert!(text.contains("no vehicle has the labels yet"), "{text}");
+    assert!(text.contains("no vehicle matches the labels yet"), "{text}");
     assert_eq!(user.sent().release, 1);
 }
 
@@ -367,7 +367,7 @@ fn a_deployment_of_a_fleet_is_listed_changed_and_removed() {
     user.cloud.answers("GET /v1/deployments", &[(200, list(json!([in_cloud(6)])))]);
     let text = user.done(&["fleet"]);
     let words: Vec<_> = text.lines().nth(1).unwrap().split_whitespace().collect();
-    let row = ["brake", "6", "bbbbbbbbbbbb", "site=berlin", "wanted", "2", "1", "0"];
+    let row = ["brake", "6", "bbbbbbbbbbbb", "site=berlin", "active", "2", "1", "0"];
     assert_eq!(words, row);
     let mut stored = in_cloud(6);
     stored["envelope"] = json!("");
@@ -393,7 +393,7 @@ fn a_deployment_of_a_fleet_is_listed_changed_and_removed() {
     assert!(user.done(&["start", "brake", "--fleet"]).ends_with("`brake` runs on 1 vehicle\n"));
     user.cloud.answers("POST /v1/deployments/brake/rollback", &[(200, in_cloud(6))]);
     let text = user.fails(4, &["rollback", "brake", "--fleet"]);
-    assert!(text.contains("car-7: it has no fallback"), "{text}");
+    assert!(text.contains("car-7: keeps release 6, which has no fallback"), "{text}");
     user.cloud.answers("DELETE /v1/deployments/brake", &[(204, json!(null))]);
     user.cloud.answers("GET /v1/vehicles/car-7/status", &[ended(&[])]);
     assert!(
@@ -430,7 +430,7 @@ fn a_deployment_in_waves_sends_its_plan_and_can_be_watched() {
     let deploy = [&DEPLOY[..], &waves].concat();
     deployments(&[in_cloud(6), in_waves(7, 1, "running", "")]);
     let text = user.done(&deploy);
-    let expected = "wave 1 of 3; it runs on 3 of 4 vehicles, and 1 failed\n\
+    let expected = "wave 1 of 3; running on 3 of 4 vehicles, 1 failed\n\
                     the next wave opens after 10min once 90 % run it: `gleaner fleet` shows them\n";
     assert!(text.ends_with(expected), "{text}");
     let seen = user.cloud.seen();
@@ -459,7 +459,7 @@ fn a_deployment_in_waves_sends_its_plan_and_can_be_watched() {
         "{text}"
     );
     for (options, reason) in
-        [(&["--success", "90%"][..], "--wave"), (&["--wave", "101%"], "`101%` is no share")]
+        [(&["--success", "90%"][..], "--wave"), (&["--wave", "101%"], "`101%` is not a percentage")]
     {
         let text = programs::output(&mut user.command(&[&DEPLOY[..], options].concat()));
         assert_eq!(text.status.code(), Some(2));
@@ -472,7 +472,7 @@ fn a_deployment_in_waves_sends_its_plan_and_can_be_watched() {
 fn waves_are_listed_paused_resumed_and_aborted() {
     let user = CloudUser::logged_in();
     let paused = in_waves(6, 2, "paused", "by ada");
-    let line = "brake: wave 2 of 3 paused by ada; it runs on 3 of 4 vehicles, and 1 failed\n";
+    let line = "brake: wave 2 of 3 paused by ada; running on 3 of 4 vehicles, 1 failed\n";
     user.cloud.answers("GET /v1/deployments", &[(200, list(json!([paused])))]);
     assert!(user.done(&["fleet"]).ends_with(line));
     for change in ["pause", "resume", "abort"] {

@@ -32,7 +32,7 @@ impl CloudUser {
         });
         user.cloud.answers("POST /v1/login", &[(200, session)]);
         let text = user.done(&["login", &user.cloud.url(), "--code", "c0de"]);
-        assert!(text.contains("as ada (admin) until 2100-01-01T00:00:00Z"), "{text}");
+        assert!(text.contains("as ada (admin; expires 2100-01-01T00:00:00Z)"), "{text}");
         assert!(!text.contains("gln_1"), "{text}");
         user
     }

@@ -31,7 +31,7 @@ fn a_login_stores_the_token_for_its_user_alone_until_the_logout() {
     assert_eq!(user.cloud.seen()[0].authorization.as_deref(), Some("Bearer gln_1"));
     assert_eq!(user.json(&["logout"]), json!({ "removed": false }));
     let text = user.fails(3, &["whoami"]);
-    assert!(text.contains("there is no token for a cloud") && text.contains("`gleaner login URL"));
+    assert!(text.contains("not logged in to a cloud") && text.contains("`gleaner login URL"));
 }
 
 #[test]
@@ -61,7 +61,7 @@ fn tokens_are_made_listed_and_removed() {
     user.cloud.answers("POST /v1/tokens", &[(200, made)]);
     user.cloud.seen();
     let text = user.done(&["tokens", "new", "nightly", "--role", "viewer", "--days", "7"]);
-    assert!(text.contains("nightly (viewer) until 2100-01-01T00:00:00Z"), "{text}");
+    assert!(text.contains("nightly (viewer; expires 2100-01-01T00:00:00Z)"), "{text}");
     assert!(text.ends_with("\n  gln_2\n"), "{text}");
     let sent = r#"{"name":"nightly","role":"viewer","days":7}"#;
     assert_eq!(user.cloud.seen()[0].body, sent.as_bytes());
@@ -192,10 +192,10 @@ fn a_list_is_followed_to_its_end_and_one_without_an_end_is_refused() {
     // Parts without entries would be requested for ever.
     user.cloud.answers("GET /v1/users?after=a%26b", &[page(0..0, "a&b")]);
     let text = user.fails(1, &["users"]);
-    assert!(text.contains("the list `/v1/users` has no end"), "{text}");
+    assert!(text.contains("the list `/v1/users` does not end"), "{text}");
     user.cloud.answers("GET /v1/clips?label=x", &[page(0..0, "1")]);
     let text = user.fails(1, &["clips", "export", "--label", "x", "--to", "out"]);
-    assert!(text.contains("the list `/v1/clips` has no end"), "{text}");
+    assert!(text.contains("the list `/v1/clips` does not end"), "{text}");
 }
 
 #[test]

@@ -38,12 +38,12 @@ fn vehicles_are_listed_enrolled_once_and_revoked() {
     assert_eq!(user.json(&["vehicles"]), vehicles);
     let enrolment = json!({
         "gleaner_enrolment": 1, "address": "127.0.0.1:8443", "vehicle": "car-7",
-        "authority": "PEM", "token": "secret",
+        "authority": "PEM", "token": "token-of-car-7",
     });
     user.cloud.answers("POST /v1/vehicles", &[(200, enrolment.clone())]);
     let enrol = ["vehicles", "enrol", "car-7", "--to", "car-7.json"];
     let text = user.done(&enrol);
-    assert!(text.contains("gleaner enrol car-7.json") && !text.contains("secret"), "{text}");
+    assert!(text.contains("gleaner enrol car-7.json") && !text.contains("token"), "{text}");
     let file = user.path("car-7.json");
     assert_eq!(fs::metadata(&file).unwrap().permissions().mode() & 0o777, 0o600);
     let written: Value = serde_json::from_slice(&fs::read(&file).unwrap()).unwrap();
@@ -163,7 +163,7 @@ fn a_vehicle_is_enrolled_once_its_cloud_has_connected() {
     let vehicle = FakeServer::on_socket(&user.path("control.sock"));
     let text = json!({
         "gleaner_enrolment": 1, "address": "10.0.0.1:8443", "vehicle": "car-7",
-        "authority": "PEM", "token": "secret",
+        "authority": "PEM", "token": "token-of-car-7",
     });
     fs::write(user.path("car-7.json"), text.to_string()).unwrap();
     let with = |address: &str, state: &str, reason: Option<&str>, help: Option<&str>| {
@@ -186,7 +186,7 @@ fn a_vehicle_is_enrolled_once_its_cloud_has_connected() {
     vehicle.answers("GET /v1/status", &[(200, status(&[])), former, connecting.clone(), connected]);
     let output = programs::output(&mut command(&["enrol", "car-7.json"]));
     let shown = String::from_utf8_lossy(&output.stdout).into_owned();
-    let expected = "cloud 10.0.0.1:8443 connected for 3s; 12 records not sent, \
+    let expected = "cloud 10.0.0.1:8443 connected for 3s; 12 unsent records, \
                     certificate until 2100-01-01T00:00:00Z\n";
     assert_eq!(shown, expected, "{}", String::from_utf8_lossy(&output.stderr));
     let seen = vehicle.seen();
@@ -213,7 +213,7 @@ fn a_vehicle_is_enrolled_once_its_cloud_has_connected() {
     vehicle.answers("PUT /v1/cloud", &[(400, problem(2, "it is for car-8"))]);
     assert!(fails(command(&["enrol", "car-7.json"]), 2).contains("it is for car-8"));
     fs::write(user.path("bad.json"), "{}").unwrap();
-    assert!(fails(command(&["enrol", "bad.json"]), 2).contains("this is no enrolment"));
+    assert!(fails(command(&["enrol", "bad.json"]), 2).contains("not an enrolment"));
     vehicle.answers("DELETE /v1/cloud", &[(200, json!(null))]);
     programs::done(&mut command(&["unenrol"]));
 }

@@ -4,7 +4,7 @@
 //! The numbered rules are at the top of the Python twin, `../python/main.py`. `road` implements
 //! them; this file calls the host.
 
-mod road;
+pub mod road;
 
 use gleaner_sdk::{Config, Field, Lambda, Result, Sample, Topic, event, input};
 

@@ -15,7 +15,7 @@ const BANDS: [(f64, f64, f64); 3] = [(0.5, 2.0, 0.2), (2.0, 8.0, 0.5), (8.0, 20.
 const PEAK_HZ: (f64, f64) = (1.0, 6.0);
 
 /// State of the rules after the samples so far.
-pub(crate) struct Road {
+pub struct Road {
     window_s: f64,
     learning: Vec<i64>,
     period_ns: i64,
@@ -35,15 +35,15 @@ struct Plan {
 
 /// Roughness of one window.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Roughness {
+pub struct Roughness {
     /// Score in (m/s²)².
-    pub(crate) score: f64,
+    pub score: f64,
     /// Frequency of the largest bin in Hz; 0 if there is no bin.
-    pub(crate) peak_hz: f64,
+    pub peak_hz: f64,
 }
 
 impl Road {
-    pub(crate) fn new(window_s: f64) -> Self {
+    pub fn new(window_s: f64) -> Self {
         Self {
             window_s,
             learning: Vec::with_capacity(LEARN),
@@ -56,7 +56,7 @@ impl Road {
 
     /// Adds a sample. Returns the length of the window that it completes, in samples; none if it
     /// completes none.
-    pub(crate) fn note(&mut self, at_ns: i64) -> Result<Option<usize>, SpectrumError> {
+    pub fn note(&mut self, at_ns: i64) -> Result<Option<usize>, SpectrumError> {
         if self.plan.is_none() {
             self.learn(at_ns)?;
         } else {
@@ -103,11 +103,7 @@ impl Road {
 
     /// Computes the roughness of the window that was just completed, from its stamps in nanoseconds
     /// and its vertical accelerations in m/s², oldest first.
-    pub(crate) fn roughness(
-        &mut self,
-        at_ns: &[i64],
-        signal: &[f64],
-    ) -> Result<Roughness, SpectrumError> {
+    pub fn roughness(&mut self, at_ns: &[i64], signal: &[f64]) -> Result<Roughness, SpectrumError> {
         let none = Roughness { score: 0.0, peak_hz: 0.0 };
         let (Some(plan), [first, .., last], [start, ..]) = (&mut self.plan, at_ns, signal) else {
             return Ok(none);

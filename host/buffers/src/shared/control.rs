@@ -44,7 +44,7 @@ pub struct ControlPage {
 /// another, so an old value of one and a new value of another may add up to more than the reader
 /// held at any time. A limit of the sum would then ignore a word that is in use.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct HoldLimits {
+pub struct PinLimits {
     /// The first word. Words for windows come first, then words for single positions.
     pub first_word: u32,
     /// Words that name a window.
@@ -55,7 +55,7 @@ pub struct HoldLimits {
     pub singles: u16,
 }
 
-impl HoldLimits {
+impl PinLimits {
     /// Returns the number of positions that a reader can hold.
     pub fn quota(&self) -> u32 {
         u32::from(self.windows) * u32::from(self.window) + u32::from(self.singles)

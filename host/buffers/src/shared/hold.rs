@@ -4,7 +4,7 @@
 use std::ops::Deref;
 use std::slice;
 
-use super::control::{ControlMemory, HazardWindow, HoldLimits, MappedControl, clear, set};
+use super::control::{ControlMemory, HazardWindow, MappedControl, PinLimits, clear, set};
 use super::layout::META_WORDS;
 use super::reader::{FoundSample, ReadError, ReaderState};
 use super::reader_fence;
@@ -14,7 +14,7 @@ use crate::sync::{Arc, AtomicU64, Mutex, MutexGuard};
 /// The hazard words of this process for one topic.
 pub(super) struct HoldTable {
     page: MappedControl,
-    limits: HoldLimits,
+    limits: PinLimits,
     /// For each word, in the order of the page.
     words: Mutex<Box<[WordUse]>>,
 }
@@ -36,7 +36,7 @@ impl WordUse {
 
 impl HoldTable {
     /// A table without holds; `None` if the words are not on the page.
-    pub(super) fn new(control: impl ControlMemory, limits: HoldLimits) -> Option<Self> {
+    pub(super) fn new(control: impl ControlMemory, limits: PinLimits) -> Option<Self> {
         let page = MappedControl::new(control);
         let words = limits.of_page(page.control())?;
         // Also maps their memory now, not at the first hold.

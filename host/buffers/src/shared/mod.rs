@@ -5,7 +5,7 @@
 //! protects what it reads by *hazards*: words on its own control page that name windows of
 //! positions. The writer reads them before it takes a slot, and trusts nothing else of that page: a
 //! reader that writes garbage there loses its own protection only, and can pin no more positions
-//! than its limits ([`HoldLimits`]), which the writer keeps to itself. So a writer with `depth +
+//! than its limits ([`PinLimits`]), which the writer keeps to itself. So a writer with `depth +
 //! quotas + 1` slots always finds a free one, never waits, and no reader can change what another
 //! one sees.
 //!
@@ -39,18 +39,18 @@
 //! holds all of it. The places have to be read before the fence, because they are written again
 //! while the samples are still held.
 
-mod bell;
 mod control;
 mod hold;
 mod layout;
+mod notifier;
 mod reader;
 mod ring;
 mod writer;
 
-pub use bell::{Bell, Futex};
-pub use control::{ControlMemory, ControlPage, HAZARDS, HoldLimits};
+pub use control::{ControlMemory, ControlPage, HAZARDS, PinLimits};
 pub use hold::{HeldSample, HeldWindow};
 pub use layout::{META_WORDS, ReadRegion, ReaderMemory, SharedLayout, WriterMemory, in_process};
+pub use notifier::{Futex, Notifier};
 pub use reader::{ReadError, SharedReader};
 pub(crate) use ring::SharedRing;
 pub use writer::{ReaderId, SharedDraft, SharedWriter, WriteError};

@@ -1,7 +1,7 @@
 //! The reading end of a topic: finds samples, and holds them in place.
 #![allow(unsafe_code)]
 
-use super::control::{ControlMemory, HoldLimits};
+use super::control::{ControlMemory, PinLimits};
 use super::hold::{HoldTable, WindowHold};
 use super::layout::{COUNTER_WORDS, META_WORDS, ReaderMemory, SharedMemory};
 use super::{HeldSample, HeldWindow};
@@ -59,7 +59,7 @@ impl SharedReader {
     pub unsafe fn new(
         memory: &ReaderMemory,
         control: impl ControlMemory,
-        limits: HoldLimits,
+        limits: PinLimits,
     ) -> Result<Self, ReadError> {
         let holds = HoldTable::new(control, limits).ok_or(ReadError::Hazards)?;
         Ok(Self(Arc::new(ReaderState { memory: Arc::clone(&memory.0), holds })))
@@ -107,30 +107,20 @@ impl SharedReader {
     }
 
     /// Holds the sample at `position`; `None` if it is not shown (any more).
-    ///
-    /// # Errors
-    ///
-    /// [`ReadError::OutOfHolds`].
+    /// Fails only with [`ReadError::OutOfHolds`].
     pub fn get(&self, position: u64) -> Result<Option<HeldSample>, ReadError> {
         Ok(self.window(position, 1)?.map(|window| window.newest()))
     }
 
     /// Holds the newest sample below position `end`; `None` if there was a moment during the
-    /// call at which none was shown.
-    ///
-    /// # Errors
-    ///
-    /// [`ReadError::OutOfHolds`].
+    /// call at which none was shown. Fails only with [`ReadError::OutOfHolds`].
     pub fn newest_before(&self, end: u64) -> Result<Option<HeldSample>, ReadError> {
         Ok(self.last_before(end, 1)?.map(|window| window.newest()))
     }
 
     /// Holds the samples at `count` positions from `first`, in place; `None` if the first of
     /// them is not shown (any more). Later ones that are not published yet are left out.
-    ///
-    /// # Errors
-    ///
-    /// [`ReadError::OutOfHolds`].
+    /// Fails only with [`ReadError::OutOfHolds`].
     pub fn window(&self, first: u64, count: u32) -> Result<Option<HeldWindow>, ReadError> {
         // No reader sees a sample before the others do, so that all have it if the writer dies.
         let end = first.saturating_add(count.min(self.depth()).into()).min(self.head());
@@ -140,22 +130,15 @@ impl SharedReader {
 
     /// Holds the newest samples below position `end`, `count` of them or fewer, oldest first.
     ///
-    /// Samples that leave during the call may be missing, but not the newest one.
-    ///
-    /// # Errors
-    ///
-    /// [`ReadError::OutOfHolds`].
+    /// Samples that leave during the call may be missing, but not the newest one. Fails only
+    /// with [`ReadError::OutOfHolds`].
     pub fn last_before(&self, end: u64, count: u32) -> Result<Option<HeldWindow>, ReadError> {
         self.newest_while(end, count, |_| true)
     }
 
     /// Holds the newest samples below position `end`, at most `max`, back to the first one whose
     /// meta data `keep` refuses; oldest first. `keep` is called newest first, and more than once
-    /// for a sample if samples leave during the call.
-    ///
-    /// # Errors
-    ///
-    /// [`ReadError::OutOfHolds`].
+    /// for a sample if samples leave during the call. Fails only with [`ReadError::OutOfHolds`].
     pub fn newest_while(
         &self,
         end: u64,
@@ -252,7 +235,7 @@ mod tests {
         let layout = SharedLayout { depth: 4, slots: 16, slot_bytes: 64 };
         let (memory, reading) = in_process(layout).unwrap();
         let (mut writer, control) = (SharedWriter::new(memory), ControlPage::on_heap());
-        let limits = HoldLimits { first_word: 0, windows: 2, window: 4, singles: 2 };
+        let limits = PinLimits { first_word: 0, windows: 2, window: 4, singles: 2 };
         writer.attach(control.clone(), limits).unwrap();
         // SAFETY: the page is attached with these limits, and nothing else stores to it.
         let reader = unsafe { SharedReader::new(&reading, control, limits) }.unwrap();

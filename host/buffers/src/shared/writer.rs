@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, VecDeque};
 use std::ops::{Deref, DerefMut};
 use std::slice;
 
-use super::control::{ControlMemory, HazardWindow, HoldLimits, MappedControl};
+use super::control::{ControlMemory, HazardWindow, MappedControl, PinLimits};
 use super::layout::{COUNTER_WORDS, META_WORDS, SharedMemory, WriterMemory};
 use super::writer_fence;
 use crate::HEADROOM;
@@ -57,7 +57,7 @@ pub struct SharedWriter {
 struct AttachedReader {
     id: ReaderId,
     page: MappedControl,
-    limits: HoldLimits,
+    limits: PinLimits,
 }
 
 /// The slot of the next sample, until it is published.
@@ -109,7 +109,7 @@ impl SharedWriter {
     pub fn attach(
         &mut self,
         control: impl ControlMemory,
-        limits: HoldLimits,
+        limits: PinLimits,
     ) -> Result<ReaderId, WriteError> {
         let page = MappedControl::new(control);
         let words = limits.of_page(page.control()).ok_or(WriteError::Hazards)?;

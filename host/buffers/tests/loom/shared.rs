@@ -4,7 +4,7 @@
 use std::time::Duration;
 
 use gleaner_buffers::shared::{
-    Bell, ControlPage, Futex, HeldSample, HoldLimits, META_WORDS, SharedLayout, SharedReader,
+    ControlPage, Futex, HeldSample, META_WORDS, Notifier, PinLimits, SharedLayout, SharedReader,
     SharedWriter, fences, in_process,
 };
 use loom::sync::Arc;
@@ -24,7 +24,7 @@ fn warm_topic(
     let (memory, reading) = in_process(SharedLayout { depth, slots, slot_bytes: 8 }).unwrap();
     let control = ControlPage::on_heap();
     let mut writer = SharedWriter::with_warm_slots(memory, warm);
-    let limits = HoldLimits { first_word: 0, windows, window: 2, singles };
+    let limits = PinLimits { first_word: 0, windows, window: 2, singles };
     writer.attach(control.clone(), limits).unwrap();
     // SAFETY: the page is attached with these limits, and nothing else stores to it.
     (writer, unsafe { SharedReader::new(&reading, control, limits) }.unwrap())
@@ -263,10 +263,10 @@ fn rings() {
         let state = loom::sync::Mutex::new(Sleep::default());
         let sleeper = Arc::new(Sleeper { state, change: loom::sync::Condvar::new() });
         let published = Arc::new(AtomicU32::new(0));
-        let bell = Bell::of(control.clone());
+        let bell = Notifier::of(control.clone());
         let (seen_by_reader, kernel) = (published.clone(), Kernel(sleeper.clone()));
         let waiting = thread::spawn(move || {
-            let mut bell = Bell::of(control);
+            let mut bell = Notifier::of(control);
             let seen = bell.value();
             if seen_by_reader.load(Ordering::Acquire) == 0 {
                 bell.wait(seen, Duration::from_secs(1), &kernel);

@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread;
 
 use gleaner_buffers::shared::{
-    ControlMemory, ControlPage, HAZARDS, HeldSample, HoldLimits, META_WORDS, ReadError, ReaderId,
+    ControlMemory, ControlPage, HAZARDS, HeldSample, META_WORDS, PinLimits, ReadError, ReaderId,
     SharedLayout, SharedReader, SharedWriter, WriteError, in_process,
 };
 
@@ -23,7 +23,7 @@ fn topic<const N: usize>(
     let mut writer = SharedWriter::new(memory);
     let attach = |(windows, window, singles)| {
         let control = ControlPage::on_heap();
-        let limits = HoldLimits { first_word: 0, windows, window, singles };
+        let limits = PinLimits { first_word: 0, windows, window, singles };
         let id = writer.attach(control.clone(), limits).unwrap();
         // SAFETY: the page is attached with these limits, and the tests store to pages of readers
         // only that hold nothing.
@@ -106,7 +106,7 @@ fn further_slots_are_used_only_while_samples_are_held() {
         in_process(SharedLayout { depth: 2, slots: 32, slot_bytes: 256 }).unwrap();
     let mut writer = SharedWriter::with_warm_slots(memory, 6);
     let control = ControlPage::on_heap();
-    let limits = HoldLimits { first_word: 0, windows: 0, window: 0, singles: 9 };
+    let limits = PinLimits { first_word: 0, windows: 0, window: 0, singles: 9 };
     writer.attach(control.clone(), limits).unwrap();
     // SAFETY: the page is attached with these limits, and nothing else stores to it.
     let reader = unsafe { SharedReader::new(&reading, control, limits) }.unwrap();
@@ -155,7 +155,7 @@ fn a_reader_that_slides_its_windows_does_not_make_each_draft_look_at_them() {
         in_process(SharedLayout { depth, slots: warm + 2 * window, slot_bytes: 256 }).unwrap();
     let mut writer = SharedWriter::with_warm_slots(memory, warm);
     let (control, looks) = (ControlPage::on_heap(), Arc::new(AtomicU64::new(0)));
-    let limits = HoldLimits { first_word: 0, windows: 2, window: window as u16, singles: 0 };
+    let limits = PinLimits { first_word: 0, windows: 2, window: window as u16, singles: 0 };
     writer.attach(CountedPage(control.clone(), looks.clone()), limits).unwrap();
     // With so many positions behind the shown ones under hazards, it tries each way to leave one
     // slot for the next draft.
@@ -196,7 +196,7 @@ fn a_reader_that_holds_its_quota_gets_no_more_and_stops_nobody() {
 fn quotas_beyond_the_slots_are_refused() {
     let (mut writer, [(_, _, id)]) = topic((2, 6, 256), [(1, 2, 0)]);
     let control = ControlPage::on_heap();
-    let limits = |first_word, singles| HoldLimits { first_word, windows: 0, window: 0, singles };
+    let limits = |first_word, singles| PinLimits { first_word, windows: 0, window: 0, singles };
     let refused = writer.attach(control.clone(), limits(0, 2)).unwrap_err();
     assert_eq!(refused, WriteError::Quota { asked: 2, left: 1 });
     for limits in [limits(0, 0), limits(HAZARDS as u32, 1), limits(u32::MAX, u16::MAX)] {

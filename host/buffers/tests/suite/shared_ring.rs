@@ -4,11 +4,11 @@
 use std::ops::ControlFlow;
 
 use gleaner_buffers::shared::{
-    ControlPage, HoldLimits, META_WORDS, SharedLayout, SharedReader, SharedWriter, in_process,
+    ControlPage, META_WORDS, PinLimits, SharedLayout, SharedReader, SharedWriter, in_process,
 };
 use gleaner_buffers::{Lease, RingCounts, RingReader};
 
-const LIMITS: HoldLimits = HoldLimits { first_word: 0, windows: 2, window: 3, singles: 2 };
+const LIMITS: PinLimits = PinLimits { first_word: 0, windows: 2, window: 3, singles: 2 };
 
 fn topic() -> (SharedWriter, SharedReader) {
     let layout = SharedLayout { depth: 4, slots: 4 + LIMITS.quota() + 1, slot_bytes: 64 };

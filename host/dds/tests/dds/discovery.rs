@@ -1,7 +1,7 @@
 //! Tests of the list of topics in a domain.
 
 use gleaner_dds::{Dds, DdsOptions, Distro};
-use gleaner_transport::{Qos, Transport, TransportError};
+use gleaner_messages::transport::{Qos, Transport, TransportError};
 
 use super::Test;
 use super::peer::{KeptSamples, Little, Peer, domain, open, options, policies, spec, until};

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 
-use gleaner_transport::{Qos, Transport};
+use gleaner_messages::transport::{Qos, Transport};
 use rustix::process::{Pid, setpriority_process};
 
 use super::Test;

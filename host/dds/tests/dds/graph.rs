@@ -1,7 +1,7 @@
 //! Tests of our node in the ROS 2 graph, read by an independent parser.
 
 use gleaner_dds::{Dds, DdsOptions, Distro};
-use gleaner_transport::{LiveSource, Transport};
+use gleaner_messages::transport::{LiveSource, Transport};
 use rustdds::RTPSEntity;
 
 use super::Test;
@@ -103,8 +103,9 @@ fn listed(distro: Distro) {
     let (domain, mut dds) = open(None);
     let peer = Peer::join(domain);
     let reader = peer.reader(TOPIC, TYPE, &policies(true, true));
-    let subscription =
-        dds.subscribe(&spec("/imu", gleaner_transport::Qos::Auto), KeptSamples::new()).unwrap();
+    let subscription = dds
+        .subscribe(&spec("/imu", gleaner_messages::transport::Qos::Auto), KeptSamples::new())
+        .unwrap();
     let imu = peer.writer("/imu", true, false);
     connected(&dds, subscription, 1);
     let out = dds.writer("/out", "std_msgs/msg/String", 5).unwrap();

@@ -3,7 +3,7 @@
 use std::net::UdpSocket;
 
 use gleaner_dds::Dds;
-use gleaner_transport::{LiveSource, Qos, Transport};
+use gleaner_messages::transport::{LiveSource, Qos, Transport};
 use rustdds::{GUID, RTPSEntity};
 
 use super::Test;

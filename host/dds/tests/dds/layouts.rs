@@ -1,7 +1,7 @@
 //! Tests of writers whose samples have another layout, a key or an encoding that is not read.
 
 use gleaner_dds::Dds;
-use gleaner_transport::{DefinitionsSearch, LiveSource, Qos, TopicSpec, Transport};
+use gleaner_messages::transport::{DefinitionsSearch, LiveSource, Qos, TopicSpec, Transport};
 use rustdds::policy::{DataRepresentation, XCDR2_DATA_REPRESENTATION};
 use rustdds::{GUID, Keyed, RTPSEntity, TopicKind};
 use serde::{Deserialize, Serialize};
@@ -29,7 +29,7 @@ fn announce_hash(domain: u16, writer: GUID, topic: &str, hash: &str) {
     announce(domain, (1..20).map(again));
 }
 
-fn warned(dds: &Dds, subscription: gleaner_transport::Subscription, sentence: &str) {
+fn warned(dds: &Dds, subscription: gleaner_messages::transport::Subscription, sentence: &str) {
     until(sentence, || {
         dds.status(subscription).qos_warnings.iter().any(|line| line.contains(sentence))
     });
@@ -52,7 +52,7 @@ fn two_layouts() {
     let (writer, type_name) = (other.guid().to_bytes(), "std_msgs/msg/String");
     let sentence = format!(
         "writer {} of `/name` sends `{type_name}` in the layout {another}, but {STRING} is read",
-        gleaner_transport::Guid(writer)
+        gleaner_messages::transport::Guid(writer)
     );
     warned(&dds, subscription, &sentence);
     connected(&dds, subscription, 2);

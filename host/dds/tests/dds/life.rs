@@ -9,8 +9,8 @@ use std::thread;
 use std::time::Duration;
 
 use gleaner_dds::{Dds, DdsOptions};
+use gleaner_messages::transport::{Clock, Delivery, LiveSource, Qos, SampleMeta, Sink, Transport};
 use gleaner_protocol::NetworkStatus;
-use gleaner_transport::{Clock, Delivery, LiveSource, Qos, SampleMeta, Sink, Transport};
 
 use super::Test;
 use super::peer::{

@@ -10,7 +10,6 @@ mod graph;
 mod hostile;
 mod layouts;
 mod life;
-mod network_namespace;
 mod peer;
 mod qos;
 mod receive;
@@ -21,7 +20,7 @@ mod write;
 use std::process::ExitCode;
 use std::sync::{PoisonError, RwLock};
 
-use network_namespace::Test;
+use gleaner_test_support::network_namespace::{self, Test};
 
 /// Held for reading by each test while it runs, and for writing by [`life::ALONE`]: that one checks
 /// all threads of this process.

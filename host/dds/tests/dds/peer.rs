@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use gleaner_dds::{Dds, DdsOptions};
-use gleaner_transport::{
+use gleaner_messages::transport::{
     Clock, Delivery, Qos, ReceptionStatus, SampleMeta, Sink, Subscription, TopicSpec, Transport,
 };
 use rustdds::no_key::{

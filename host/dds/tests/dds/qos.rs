@@ -1,6 +1,6 @@
 //! Tests of offered and requested quality of service.
 
-use gleaner_transport::{Qos, Transport};
+use gleaner_messages::transport::{Qos, Transport};
 use rustdds::RTPSEntity;
 
 use super::Test;

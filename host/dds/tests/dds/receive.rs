@@ -4,7 +4,9 @@ use std::sync::{Arc, Mutex};
 
 use bytes::Bytes;
 use gleaner_messages::Endian;
-use gleaner_transport::{Delivery, Guid, LiveSource, Qos, SampleMeta, Sink, TopicSpec, Transport};
+use gleaner_messages::transport::{
+    Delivery, Guid, LiveSource, Qos, SampleMeta, Sink, TopicSpec, Transport,
+};
 use rustdds::{RTPSEntity, Timestamp};
 
 use super::Test;

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use gleaner_dds::{Dds, DdsOptions};
 use gleaner_messages::FieldPath;
-use gleaner_transport::{DefinitionsSearch, LiveSource, Transport, TransportError};
+use gleaner_messages::transport::{DefinitionsSearch, LiveSource, Transport, TransportError};
 use ros2_client::qos::{Durability, History, WhenFull};
 use ros2_client::{
     Context, Message, MessageTypeName, Name, Node, NodeName, NodeOptions, QosProfile,
@@ -419,9 +419,9 @@ fn stale() {
 
 fn late_writer() {
     let (domain, mut dds) = open();
-    let spec = gleaner_transport::TopicSpec {
+    let spec = gleaner_messages::transport::TopicSpec {
         type_name: "car_msgs/msg/Wheel".to_owned(),
-        ..super::peer::spec("/wheel", gleaner_transport::Qos::Auto)
+        ..super::peer::spec("/wheel", gleaner_messages::transport::Qos::Auto)
     };
     dds.subscribe(&spec, super::peer::KeptSamples::new()).unwrap();
     for _ in 0..5 {

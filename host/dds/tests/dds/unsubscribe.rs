@@ -4,7 +4,7 @@ use std::collections::HashSet;
 use std::sync::Arc;
 
 use gleaner_dds::{Dds, DdsOptions, Distro};
-use gleaner_transport::{LiveSource, Qos, ReceptionStatus, Subscription, Transport};
+use gleaner_messages::transport::{LiveSource, Qos, ReceptionStatus, Subscription, Transport};
 
 use super::Test;
 use super::peer::{

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use gleaner_transport::{
+use gleaner_messages::transport::{
     Delivery, LatchedSample, LatchedTopics, SampleMeta, Sink, Subscription, TopicSpec, Transport,
 };
 use tracing::warn;
@@ -77,7 +77,7 @@ impl Replay {
             }
         }
         if dropped > 0 {
-            warn!(dropped, "latched samples from before the replayed part are left out");
+            warn!(dropped, "skipped latched samples from before the replayed part");
         }
         self.latched.make_contiguous().sort_by_key(|earlier| earlier.sample.meta.at_ns);
         Ok(())

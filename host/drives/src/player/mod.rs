@@ -8,21 +8,21 @@ mod route;
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 
 use gleaner_base::visible;
 use gleaner_messages::Definitions;
-use gleaner_transport::{
+use gleaner_messages::transport::{
     Clock, DiscoveredTopic, Guid, Health, LiveSource, PublishError, Publisher, Sink, Subscription,
     TopicSpec, Transport, TransportError, same_type,
 };
 use tracing::error;
 
-use super::catalog::Catalog;
-use super::drive::Replay;
-use super::error::ReplayError;
-use super::options::DriveOptions;
+use crate::catalog::Catalog;
+use crate::drive::Replay;
+use crate::error::ReplayError;
+use crate::options::DriveOptions;
 use playback::{Playback, PlaybackState};
 use route::{LoopedPublisher, TopicRoute};
 
@@ -89,7 +89,7 @@ impl DrivePlayer {
             Ok(_) => return Ok(spec.type_name.clone()),
             Err(error) => error,
         };
-        let routes = self.routes.lock().unwrap_or_else(PoisonError::into_inner);
+        let routes = self.routes();
         let found = match (&error, routes.get(&spec.topic)) {
             (TransportError::NoSuchTopic { .. }, Some(published)) => published.type_name(),
             _ => return Err(error),
@@ -97,16 +97,16 @@ impl DrivePlayer {
         if same_type(found, &spec.type_name) {
             return Ok(found.to_owned());
         }
-        Err(TransportError::WrongType {
-            topic: spec.topic.clone(),
-            wanted: spec.type_name.clone(),
-            found: found.to_owned(),
-        })
+        Err(wrong_type(&spec.topic, &spec.type_name, found))
+    }
+
+    fn routes(&self) -> MutexGuard<'_, BTreeMap<String, Arc<TopicRoute>>> {
+        self.routes.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Returns the route of a topic; a new one has type `type_name`.
     fn route(&self, topic: &str, type_name: &str) -> Arc<TopicRoute> {
-        let mut routes = self.routes.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut routes = self.routes();
         let route = routes
             .entry(topic.to_owned())
             .or_insert_with(|| Arc::new(TopicRoute::new(type_name.to_owned(), self.clock)));
@@ -127,18 +127,12 @@ impl Transport for DrivePlayer {
         sink: Arc<dyn Sink>,
     ) -> Result<Subscription, TransportError> {
         let type_name = self.type_of(spec)?;
-        if self.drive.is_none()
-            && !self.routes.lock().unwrap_or_else(PoisonError::into_inner).contains_key(&spec.topic)
-        {
+        if self.drive.is_none() && !self.routes().contains_key(&spec.topic) {
             return Err(TransportError::AlreadyStarted { topic: spec.topic.clone() });
         }
         let route = self.route(&spec.topic, &type_name);
         if !same_type(route.type_name(), &type_name) {
-            return Err(TransportError::WrongType {
-                topic: spec.topic.clone(),
-                wanted: type_name,
-                found: route.type_name().to_owned(),
-            });
+            return Err(wrong_type(&spec.topic, &type_name, route.type_name()));
         }
         let subscription = Subscription(self.subscriptions.len());
         route.add(subscription, spec.max_bytes, sink);
@@ -147,7 +141,7 @@ impl Transport for DrivePlayer {
     }
 
     fn definitions(&self, topic: &str) -> Result<Arc<Definitions>, TransportError> {
-        let routes = self.routes.lock().unwrap_or_else(PoisonError::into_inner);
+        let routes = self.routes();
         self.catalog.definitions(topic, routes.get(topic).map(|route| route.type_name()))
     }
 }
@@ -180,8 +174,7 @@ impl LiveSource for DrivePlayer {
             |known| known.type_name.clone(),
         );
         if !same_type(&found, type_name) {
-            let (topic, wanted) = (topic.to_owned(), type_name.to_owned());
-            return Err(PublishError(TransportError::WrongType { topic, wanted, found }.into()));
+            return Err(PublishError(wrong_type(topic, type_name, &found).into()));
         }
         let mut publishers = self.publishers.lock().unwrap_or_else(PoisonError::into_inner);
         *publishers += 1;
@@ -197,14 +190,13 @@ impl LiveSource for DrivePlayer {
     /// Starts to play the topics that are subscribed.
     fn begin(&mut self) {
         let Some(mut drive) = self.drive.take() else { return };
-        let routes = self.routes.lock().unwrap_or_else(PoisonError::into_inner);
-        for (topic, route) in routes.iter() {
+        for (topic, route) in self.routes().iter() {
             let spec = TopicSpec {
                 topic: topic.clone(),
                 type_name: route.type_name().to_owned(),
                 queue: 0,
                 max_bytes: route.max_bytes().max(UNPACKED_BYTES),
-                qos: gleaner_transport::Qos::Auto,
+                qos: gleaner_messages::transport::Qos::Auto,
             };
             match drive.subscribe(&spec, route.clone()) {
                 // It is only published.
@@ -225,6 +217,11 @@ impl LiveSource for DrivePlayer {
     fn has_ended(&self) -> bool {
         self.state.has_ended()
     }
+}
+
+fn wrong_type(topic: &str, wanted: &str, found: &str) -> TransportError {
+    let [topic, wanted, found] = [topic, wanted, found].map(str::to_owned);
+    TransportError::WrongType { topic, wanted, found }
 }
 
 impl Drop for DrivePlayer {

@@ -4,6 +4,7 @@ use std::error::Error;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+use gleaner_base::chain;
 use tracing::warn;
 
 use crate::drive::Replay;
@@ -77,13 +78,7 @@ impl Playback {
     pub(super) fn run(mut self) {
         let damage = self.play().err().map(|error| {
             warn!(error = &error as &dyn Error, "the drive ends early");
-            let mut text = error.to_string();
-            let mut cause = error.source();
-            while let Some(why) = cause {
-                text = format!("{text}: {why}");
-                cause = why.source();
-            }
-            text
+            chain(&error)
         });
         self.state.end(damage);
     }

@@ -3,7 +3,7 @@
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use gleaner_transport::{
+use gleaner_messages::transport::{
     Clock, Delivery, Guid, PublishError, Publisher, SampleMeta, Sink, Subscription,
 };
 

@@ -4,10 +4,10 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
 use gleaner_drives::{Damage, Replay, ReplayError, ReplayStep};
-use gleaner_transport::{DiscoveredTopic, Guid, Transport};
+use gleaner_messages::transport::{DiscoveredTopic, Guid, Transport};
 
 use crate::support::{
-    MAGIC, TEXT, TYPE, Written, add_channel, begin, file, finish, listen, record, run, run_whole,
+    MAGIC, TEXT, TYPE, Written, add_channel, begin, begun, file, finish, record, run, run_whole,
     spec, text, write, write_data,
 };
 
@@ -40,8 +40,7 @@ fn drive_of(channels: &[ChannelSpec<'_>], first: u64) -> PathBuf {
 }
 
 fn steps(paths: &[PathBuf], topics: &[&str]) -> Vec<ReplayStep> {
-    let mut replay = Replay::open(paths).unwrap();
-    listen(&mut replay, topics);
+    let (mut replay, _) = begun(paths, topics);
     run_whole(&mut replay)
 }
 

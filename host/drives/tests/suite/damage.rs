@@ -5,11 +5,9 @@ use mcap::WriteOptions;
 use mcap::records::ChunkIndex;
 
 use crate::support::{
-    TEXT, TYPE, Written, add_channel, begin, damage, drive, expected, file, finish, listen,
-    replayed, run, run_whole, small_chunks, ticking, write, write_data,
+    TEXT, TOPICS, TYPE, Written, add_channel, begin, begun, damage, drive, expected, file, finish,
+    listen, replayed, run, run_whole, small_chunks, ticking, write, write_data,
 };
-
-const TOPICS: [&str; 2] = ["/a", "/b"];
 
 fn messages() -> Vec<Written> {
     ticking(&TOPICS, 300, 1000)
@@ -33,7 +31,9 @@ fn a_file_truncated_anywhere_delivers_every_whole_chunk_before_the_cut() {
             let cut = bytes.len() * part / 50;
             let (all, error) = match Replay::open(&[file(&bytes[..cut])]) {
                 // Cut before the first channel: there is no topic to subscribe.
-                Ok(replay) if gleaner_transport::Transport::topics(&replay).len() < 2 => continue,
+                Ok(replay) if gleaner_messages::transport::Transport::topics(&replay).len() < 2 => {
+                    continue;
+                }
                 Ok(_) => replayed(&[file(&bytes[..cut])], &TOPICS),
                 Err(error) => panic!("cut at {cut}: {error}"),
             };
@@ -52,7 +52,7 @@ fn a_truncated_file_without_chunks_delivers_every_whole_message() {
     let mut most = 0;
     for cut in (200..bytes.len()).step_by(97) {
         let replay = Replay::open(&[file(&bytes[..cut])]).unwrap();
-        if gleaner_transport::Transport::topics(&replay).len() < 2 {
+        if gleaner_messages::transport::Transport::topics(&replay).len() < 2 {
             continue;
         }
         let (all, error) = replayed(&[file(&bytes[..cut])], &TOPICS);
@@ -173,13 +173,12 @@ fn messages_that_are_not_cdr_are_left_out_and_counted() {
             }
             write(&mut writer, channel, message);
         }
-        let mut replay = Replay::open(&[file(&finish(writer))]).unwrap();
-        let memory = listen(&mut replay, &["/a"]);
+        let (mut replay, memory) = begun(&[file(&finish(writer))], &["/a"]);
         let steps = run_whole(&mut replay);
         assert!(memory.values().iter().map(|(_, value)| *value).eq(0..6));
         // Time passes with it, as for every other message.
         assert!(steps.len() == 7 && steps[3].at_ns == 35);
-        assert_eq!(steps[3].delivery, gleaner_transport::Delivery::Malformed);
+        assert_eq!(steps[3].delivery, gleaner_messages::transport::Delivery::Malformed);
         assert_eq!(replay.malformed()["/a"], 1);
     }
 }
@@ -240,8 +239,7 @@ fn damage_before_a_part_costs_its_latched_samples_alone_and_is_reported_at_its_e
 #[test]
 fn after_the_error_there_is_nothing_more() {
     let bytes = drive(small_chunks(), &messages());
-    let mut replay = Replay::open(&[file(&bytes[..bytes.len() / 2])]).unwrap();
-    listen(&mut replay, &TOPICS);
+    let (mut replay, _) = begun(&[file(&bytes[..bytes.len() / 2])], &TOPICS);
     let (_, error) = run(&mut replay);
     damage(error);
     assert!(replay.step().unwrap().is_none());

@@ -3,10 +3,10 @@
 use std::process::Command;
 
 use gleaner_drives::{Replay, read_extras};
-use gleaner_transport::Transport;
+use gleaner_messages::transport::Transport;
 use mcap::{Compression, WriteOptions};
 
-use crate::support::{drive, file, listen, run, small_chunks, spec, ticking};
+use crate::support::{begun, drive, file, run, small_chunks, spec, ticking};
 
 /// Set in the process that the test starts.
 const CHILD: &str = "GLEANER_DRIVES_TEST";
@@ -90,16 +90,19 @@ fn flip_random_bytes() {
     }
     // The undamaged drives are still readable.
     for bytes in drives {
-        let mut replay = Replay::open(&[file(&bytes)]).unwrap();
-        listen(&mut replay, &["/a", "/b"]);
+        let (mut replay, _) = begun(&[file(&bytes)], &["/a", "/b"]);
         assert_eq!(run(&mut replay).0.len(), messages.len());
     }
 }
 
 struct CountingSink;
 
-impl gleaner_transport::Sink for CountingSink {
-    fn deliver(&self, _: &gleaner_transport::SampleMeta, _: &[u8]) -> gleaner_transport::Delivery {
-        gleaner_transport::Delivery::Taken
+impl gleaner_messages::transport::Sink for CountingSink {
+    fn deliver(
+        &self,
+        _: &gleaner_messages::transport::SampleMeta,
+        _: &[u8],
+    ) -> gleaner_messages::transport::Delivery {
+        gleaner_messages::transport::Delivery::Taken
     }
 }

@@ -6,11 +6,9 @@ use mcap::WriteOptions;
 use mcap::records::ChunkIndex;
 
 use crate::support::{
-    MAGIC, TEXT, TYPE, Written, damage, delivered, drive, expected, file, finished, listen, record,
-    replayed, run, small_chunks, text, ticking,
+    MAGIC, TEXT, TOPICS, TYPE, Written, begun, damage, delivered, drive, expected, file, finished,
+    listen, record, replayed, run, small_chunks, text, ticking,
 };
-
-const TOPICS: [&str; 2] = ["/a", "/b"];
 
 fn schema(id: u16, name: &str, encoding: &str, definitions: &str) -> Vec<u8> {
     record(3, &[&id.to_le_bytes()[..], &text(name), &text(encoding), &text(definitions)].concat())
@@ -129,8 +127,7 @@ fn a_message_with_a_stamp_out_of_range_is_left_out_and_counted() {
         let mut messages = ticking(&["/a", "/b"], 300, 1000);
         messages[200].at = late;
         for options in [small_chunks(), small_chunks().use_chunks(false)] {
-            let mut replay = Replay::open(&[file(&drive(options, &messages))]).unwrap();
-            let memory = listen(&mut replay, &["/a", "/b"]);
+            let (mut replay, memory) = begun(&[file(&drive(options, &messages))], &["/a", "/b"]);
             assert_eq!(replay.end_ns(), None);
             assert!(run(&mut replay).1.is_none());
             let others = [&messages[..200], &messages[201..]].concat();

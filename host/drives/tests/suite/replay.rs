@@ -4,13 +4,14 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use gleaner_drives::{DriveLimits, DriveOptions, Progress, Replay, ReplayError};
+use gleaner_messages::transport::{Subscription, TopicSpec, Transport, TransportError};
 use gleaner_messages::{CompressedView, Endian, FieldPath, header_stamp};
-use gleaner_transport::{Subscription, TopicSpec, Transport, TransportError};
 use mcap::{Compression, WriteOptions};
 
 use crate::support::{
-    MemorySink, TEXT, TYPE, Written, add_channel, begin, delivered, drive, expected, file, finish,
-    listen, replayed, run, run_whole, sample_drive, small_chunks, spec, ticking, write, write_data,
+    MemorySink, TEXT, TYPE, Written, add_channel, begin, begun, delivered, drive, expected, file,
+    finish, listen, replayed, run, run_whole, sample_drive, small_chunks, spec, ticking, write,
+    write_data,
 };
 
 const SAMPLE: [(&str, &str, u64); 3] = [
@@ -144,8 +145,7 @@ fn two_files_are_one_drive_and_equal_times_follow_the_order_of_the_files() {
     let paths = [file(&drive(small_chunks(), &first)), file(&drive(small_chunks(), &second))];
     let both: Vec<Written> = first.iter().chain(&second).cloned().collect();
     assert_eq!(delivered(&paths, &["/a", "/b", "/c"]), expected(&both));
-    let mut replay = Replay::open(&paths).unwrap();
-    let memory = listen(&mut replay, &["/a"]);
+    let (mut replay, memory) = begun(&paths, &["/a"]);
     assert_eq!(replay.progress().total, Some(200));
     run(&mut replay);
     let writers: BTreeSet<String> =
@@ -167,8 +167,7 @@ fn equal_times_in_one_file_follow_the_channels_then_the_file() {
 #[test]
 fn peeking_delivers_nothing_and_stepping_delivers_one() {
     let path = file(&drive(small_chunks(), &ticking(&["/a"], 3, 100)));
-    let mut replay = Replay::open(&[path]).unwrap();
-    let memory = listen(&mut replay, &["/a"]);
+    let (mut replay, memory) = begun(&[path], &["/a"]);
     for at in [100, 110, 120] {
         assert_eq!(replay.peek_at_ns().unwrap(), Some(at));
         assert_eq!(replay.peek_at_ns().unwrap(), Some(at));
@@ -182,8 +181,7 @@ fn peeking_delivers_nothing_and_stepping_delivers_one() {
 #[test]
 fn two_subscriptions_of_one_topic_both_get_every_message() {
     let path = file(&drive(small_chunks(), &ticking(&["/a"], 50, 100)));
-    let mut replay = Replay::open(&[path]).unwrap();
-    let memory = listen(&mut replay, &["/a", "/a"]);
+    let (mut replay, memory) = begun(&[path], &["/a", "/a"]);
     let steps = run_whole(&mut replay);
     assert_eq!(replay.progress(), Progress { done: 100, total: Some(100) });
     for (n, pair) in steps.chunks(2).enumerate() {
@@ -201,8 +199,7 @@ fn sequence_numbers_increase_even_if_the_recorder_did_not_count() {
     for (message, sequence) in messages.iter_mut().zip([0, 0, 7, 3, 8, 20]) {
         message.sequence = sequence;
     }
-    let mut replay = Replay::open(&[file(&drive(small_chunks(), &messages))]).unwrap();
-    listen(&mut replay, &["/a"]);
+    let (mut replay, _) = begun(&[file(&drive(small_chunks(), &messages))], &["/a"]);
     let (steps, _) = run(&mut replay);
     assert!(steps.iter().map(|step| step.meta.seq).eq([1, 2, 7, 8, 9, 20]));
     assert!(steps.iter().all(|step| step.meta.publish_ns == step.at_ns + 1));
@@ -213,8 +210,7 @@ fn big_endian_messages_are_marked_as_such() {
     let mut writer = begin();
     let channel = add_channel(&mut writer, "/a", TEXT);
     write_data(&mut writer, channel, 1, &[0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 9]);
-    let mut replay = Replay::open(&[file(&finish(writer))]).unwrap();
-    let memory = listen(&mut replay, &["/a"]);
+    let (mut replay, memory) = begun(&[file(&finish(writer))], &["/a"]);
     run(&mut replay);
     let taken = memory.0.lock().unwrap();
     let value = FieldPath::compile(&replay.definitions("/a").unwrap(), "value").unwrap();
@@ -320,8 +316,7 @@ fn each_message_is_read_by_the_layout_of_its_channel() {
     for (paths, layouts, x) in
         [(&[one][..], vec![0, 1, 0], [0.0, 11.0, 2.0]), (&two, vec![0, 0, 1], [0.0, 0.0, 11.0])]
     {
-        let mut replay = Replay::open(paths).unwrap();
-        let memory = listen(&mut replay, &["/a"]);
+        let (mut replay, memory) = begun(paths, &["/a"]);
         assert!(run(&mut replay).1.is_none());
         let path = FieldPath::compile(&replay.definitions("/a").unwrap(), "x").unwrap();
         let taken = memory.0.lock().unwrap();
@@ -453,8 +448,7 @@ fn a_channel_without_messages_costs_its_topic_nothing() {
     add_channel(&mut writer, "/a", "string value\n");
     let channel = add_channel(&mut writer, "/a", TEXT);
     write(&mut writer, channel, &ticking(&["/a"], 1, 100)[0]);
-    let mut replay = Replay::open(&[file(&finish(writer))]).unwrap();
-    listen(&mut replay, &["/a"]);
+    let (mut replay, _) = begun(&[file(&finish(writer))], &["/a"]);
     assert_eq!(run(&mut replay).0.len(), 1);
     FieldPath::compile(&replay.definitions("/a").unwrap(), "value").unwrap();
     assert!(replay.topics()[0].other_definitions.is_empty());

@@ -1,90 +1,18 @@
-//! Shared by the tests: a CDR writer, generated drives, and a sink that keeps its samples.
-// Each test program uses only a part of it.
-#![allow(dead_code)]
+//! Shared by the tests: generated drives, and their replay.
 
 use std::collections::BTreeMap;
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex};
 
 use gleaner_drives::{Damage, DamageLocation, Replay, ReplayError, ReplayStep};
-use gleaner_messages::Endian;
-use gleaner_transport::{Delivery, SampleMeta, Sink, TopicSpec, Transport};
+use gleaner_messages::transport::Transport;
+pub use gleaner_test_support::drives::{MemorySink, TEXT, TYPE, sample_drive, spec};
 use mcap::records::MessageHeader;
 use mcap::{WriteOptions, Writer};
 
-/// Writes CDR as a ROS 2 node does, implemented independently of the parser under test.
-pub struct CdrBytes {
-    pub bytes: Vec<u8>,
-    endian: Endian,
-}
-
-impl CdrBytes {
-    pub fn new(endian: Endian) -> Self {
-        Self { bytes: Vec::new(), endian }
-    }
-
-    fn put<const N: usize>(mut self, mut little: [u8; N]) -> Self {
-        while !self.bytes.len().is_multiple_of(N) {
-            self.bytes.push(0xAA);
-        }
-        if self.endian == Endian::Big {
-            little.reverse();
-        }
-        self.bytes.extend(little);
-        self
-    }
-
-    pub fn u8(self, value: u8) -> Self {
-        self.put([value])
-    }
-
-    pub fn i16(self, value: i16) -> Self {
-        self.put(value.to_le_bytes())
-    }
-
-    pub fn u16(self, value: u16) -> Self {
-        self.put(value.to_le_bytes())
-    }
-
-    pub fn i32(self, value: i32) -> Self {
-        self.put(value.to_le_bytes())
-    }
-
-    pub fn u32(self, value: u32) -> Self {
-        self.put(value.to_le_bytes())
-    }
-
-    pub fn i64(self, value: i64) -> Self {
-        self.put(value.to_le_bytes())
-    }
-
-    pub fn f32(self, value: f32) -> Self {
-        self.put(value.to_le_bytes())
-    }
-
-    pub fn f64(self, value: f64) -> Self {
-        self.put(value.to_le_bytes())
-    }
-
-    pub fn text(self, value: &str) -> Self {
-        let mut cdr = self.u32(value.len() as u32 + 1);
-        cdr.bytes.extend(value.as_bytes());
-        cdr.bytes.push(0);
-        cdr
-    }
-
-    pub fn blob(self, value: &[u8]) -> Self {
-        let mut cdr = self.u32(value.len() as u32);
-        cdr.bytes.extend(value);
-        cdr
-    }
-}
-
-pub fn sample_drive() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/data/highway_drive.mcap")
-}
+pub const TOPICS: [&str; 2] = ["/a", "/b"];
 
 #[derive(Clone, Debug)]
 pub struct Written {
@@ -93,9 +21,6 @@ pub struct Written {
     pub sequence: u32,
     pub value: i64,
 }
-
-pub const TYPE: &str = "test_msgs/msg/Number";
-pub const TEXT: &str = "int64 value\n";
 
 /// Returns messages on `topics` in turn, one per 10 ns from `first` on.
 pub fn ticking(topics: &[&'static str], count: usize, first: u64) -> Vec<Written> {
@@ -183,36 +108,19 @@ pub fn file(bytes: &[u8]) -> PathBuf {
     path
 }
 
-#[derive(Default)]
-pub struct MemorySink(pub Mutex<Vec<(SampleMeta, Vec<u8>)>>);
-
-impl Sink for MemorySink {
-    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Delivery {
-        self.0.lock().unwrap().push((*meta, cdr.to_vec()));
-        Delivery::Taken
-    }
-}
-
-impl MemorySink {
-    /// Returns (log time, value) of each message, for drives of [`drive`].
-    pub fn values(&self) -> Vec<(i64, i64)> {
-        let taken = self.0.lock().unwrap();
-        let value = |cdr: &[u8]| i64::from_le_bytes(cdr.try_into().unwrap());
-        taken.iter().map(|(meta, cdr)| (meta.at_ns, value(cdr))).collect()
-    }
-}
-
-pub fn spec(topic: &str) -> TopicSpec {
-    let (topic, type_name) = (topic.to_owned(), TYPE.to_owned());
-    TopicSpec { topic, type_name, queue: 1, max_bytes: 1 << 20, qos: Default::default() }
-}
-
 pub fn listen(replay: &mut Replay, topics: &[&str]) -> Arc<MemorySink> {
     let memory = Arc::new(MemorySink::default());
     for topic in topics {
         replay.subscribe(&spec(topic), memory.clone()).unwrap();
     }
     memory
+}
+
+/// Opens a drive, and subscribes to `topics`.
+pub fn begun(paths: &[PathBuf], topics: &[&str]) -> (Replay, Arc<MemorySink>) {
+    let mut replay = Replay::open(paths).unwrap();
+    let memory = listen(&mut replay, topics);
+    (replay, memory)
 }
 
 pub fn run(replay: &mut Replay) -> (Vec<ReplayStep>, Option<ReplayError>) {
@@ -251,8 +159,7 @@ pub fn delivered(paths: &[PathBuf], topics: &[&str]) -> Vec<(i64, i64)> {
 
 /// Replays drives of [`drive`]: returns the delivered (log time, value) pairs, and the error.
 pub fn replayed(paths: &[PathBuf], topics: &[&str]) -> (Vec<(i64, i64)>, Option<ReplayError>) {
-    let mut replay = Replay::open(paths).unwrap();
-    let memory = listen(&mut replay, topics);
+    let (mut replay, memory) = begun(paths, topics);
     let (_, error) = run(&mut replay);
     assert_eq!(replay.out_of_order(), 0);
     (memory.values(), error)

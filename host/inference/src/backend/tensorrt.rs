@@ -108,7 +108,7 @@ mod tests {
             }
             match &model[..] {
                 b"model" | b"engine of model" => Ok(Box::new(FakeGraph)),
-                _ => Err(BackendError::new("it is no engine of this model")),
+                _ => Err(BackendError::new("it is not an engine of this model")),
             }
         }
     }
@@ -152,7 +152,7 @@ mod tests {
         );
         assert_eq!(
             note(built("Orin", b"engine of another")),
-            format!("its engine cannot be used: it is no engine of this model: {how}")
+            format!("its engine cannot be used: it is not an engine of this model: {how}")
         );
         let damaged = EngineUse::Refused("it is too short".to_owned());
         assert_eq!(note(damaged), format!("its engine is not used: it is too short: {how}"));
@@ -170,6 +170,6 @@ mod tests {
         assert_eq!(build(&ORIN, &path), Ok((Some("Orin".to_owned()), String::new())));
         assert_eq!(fs::read(&path).unwrap(), b"engine of model");
         let failed = loaded(&ORIN, b"no model", EngineUse::Build(path));
-        assert_eq!(failed, Err("it is no engine of this model".to_owned()));
+        assert_eq!(failed, Err("it is not an engine of this model".to_owned()));
     }
 }

@@ -98,7 +98,6 @@ impl<'a> OnnxNode<'a> {
         self.inputs.get(index).copied().unwrap_or_default()
     }
 
-    /// Returns the first output.
     pub(super) fn output(&self) -> &'a str {
         self.outputs.first().copied().unwrap_or_default()
     }

@@ -52,7 +52,7 @@ mod model_field {
 /// The reason why a model is refused before it is loaded.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum InspectError {
-    #[error("it is no ONNX model: it is no protobuf message with a version and a graph")]
+    #[error("it is not an ONNX model: it is not a protobuf message with a version and a graph")]
     NoModel,
     #[error("its graphs are nested more than {max} deep")]
     TooDeep { max: usize },
@@ -99,10 +99,6 @@ fn elements() -> String {
 }
 
 /// Checks the file of a model, and returns its inputs and outputs.
-///
-/// # Errors
-///
-/// [`InspectError`] names the first problem.
 pub fn inspect(model: &[u8]) -> Result<ModelSignature, InspectError> {
     let (mut graph, mut has_version, mut opset) = (None, false, None);
     let (mut has_functions, mut metadata, mut metadata_bytes) = (false, Vec::new(), 0);

@@ -3,7 +3,7 @@
 use gleaner_protocol::inference::{Element, TensorInfo};
 
 use super::*;
-use crate::onnx::{
+use gleaner_test_support::onnx::{
     ANY, BOOL, FLOAT32, INT64, Proto, STRING, constant, doubled, external, graph, graph_attribute,
     model, model_with_opset, node, number_attribute, number_of, product, unary, value, value_of,
 };
@@ -49,7 +49,8 @@ fn inputs_and_outputs_are_read_without_constants() {
 
 #[test]
 fn bytes_that_are_no_model_are_refused() {
-    let no_model = "it is no ONNX model: it is no protobuf message with a version and a graph";
+    let no_model = "it is not an ONNX model: it is not a protobuf message with a version and a \
+                    graph";
     let whole = product();
     let twice = Proto(whole.clone()).message(7, &graph(&[], &[], &[], &[])).0;
     let huge_name = Proto::default().number(1, 8).0;

@@ -2,7 +2,7 @@
 //! length before that many bytes are there.
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("it is no protobuf message")]
+#[error("it is not a protobuf message")]
 pub(super) struct NoMessage;
 
 #[derive(Debug, Clone, Copy, PartialEq)]

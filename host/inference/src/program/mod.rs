@@ -16,11 +16,11 @@ use std::time::Duration;
 
 use clap::Parser;
 use gleaner_base::{Exit, Failure};
-use gleaner_jail::{Paths, inference as sandbox};
 use gleaner_protocol::Handover;
 use gleaner_protocol::inference::{InferenceReport, InferenceServer};
-use gleaner_vitals::start::{reports, stop_socket};
-use gleaner_vitals::{ReportWriter, log};
+use gleaner_protocol::process_stats::start::{reports, stop_socket};
+use gleaner_protocol::process_stats::{ReportWriter, log};
+use gleaner_sandbox::{Paths, inference as sandbox};
 use rustix::process::{Signal, set_parent_process_death_signal};
 use tracing::warn;
 
@@ -77,7 +77,7 @@ fn start(
     // A starter that dies also closes the control connection.
     set_parent_process_death_signal(Some(Signal::TERM))
         .map_err(io::Error::from)
-        .map_err(internal("cannot watch for the starter's death"))?;
+        .map_err(internal("cannot watch for the parent process's death"))?;
     let stop = stop_socket().map_err(internal("cannot handle SIGTERM"))?;
     let (control, running) = connections()?;
     // Not without seals: a lambda could take memory away while it is read.

@@ -7,10 +7,10 @@ use gleaner_protocol::inference::{
     ModelCall, ModelClient, ModelFaultKind, ModelWait, report_state,
 };
 
-use crate::onnx::{ANY, as_many_as_requested, endless, product};
 use crate::support::{
     ModelProgram, ModelUser, fault, floats, granted, in_future, integers, wait_for,
 };
+use gleaner_test_support::onnx::{ANY, as_many_as_requested, endless, product};
 
 #[test]
 fn an_endless_model_is_answered_at_the_deadline_and_ends_the_process_which_names_it() {

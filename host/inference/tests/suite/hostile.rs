@@ -9,8 +9,8 @@ use gleaner_protocol::inference::{
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::net::{RecvFlags, SendFlags, recv, send};
 
-use crate::onnx::{ANY, FLOAT32, endless, product, unary};
 use crate::support::{ModelProgram, ModelUser, TestModel, fault, floats, granted};
+use gleaner_test_support::onnx::{ANY, FLOAT32, endless, product, unary};
 
 fn models() -> Vec<TestModel> {
     vec![granted("product", product()), granted("endless", endless(&[ANY]))]

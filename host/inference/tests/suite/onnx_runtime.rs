@@ -4,8 +4,8 @@ use std::time::Duration;
 
 use gleaner_protocol::inference::{Element, ModelFaultKind};
 
-use crate::onnx::{ANY, endless, number_of, product, unary};
 use crate::support::{ModelProgram, TestModel, TestTensor, fault, floats, granted};
+use gleaner_test_support::onnx::{ANY, endless, number_of, product, unary};
 
 /// Returns the path of the library, if there is one for tests.
 pub fn library() -> Option<String> {

@@ -2,11 +2,11 @@
 
 use gleaner_protocol::inference::{ModelFaultKind, ModelState};
 
-use crate::onnx::{
+use crate::support::{ModelProgram, TestModel, digest, fault, granted};
+use gleaner_test_support::onnx::{
     FLOAT32, INT16, Proto, STRING, external, graph, model, model_with_opset, node, product, unary,
     value,
 };
-use crate::support::{ModelProgram, TestModel, digest, fault, granted};
 
 /// Opens a model that cannot be loaded; returns the reason.
 #[track_caller]
@@ -30,8 +30,12 @@ fn models_that_cannot_run_are_refused_with_the_reason_and_others_go_on() {
     let text = graph(&[], &[], &[value("x", STRING, &[1])], &outputs());
     let outside = graph(&[], &[external("w", "weights.bin")], &inputs(), &outputs());
     for (name, bytes, reason) in [
-        ("random", (0..5000_u32).map(|it| ((it * it) >> 3) as u8).collect(), "it is no ONNX model"),
-        ("empty", Vec::new(), "it is no ONNX model"),
+        (
+            "random",
+            (0..5000_u32).map(|it| ((it * it) >> 3) as u8).collect(),
+            "it is not an ONNX model",
+        ),
+        ("empty", Vec::new(), "it is not an ONNX model"),
         ("large", vec![0; 100_001], "it has 100001 bytes; 100000 are allowed"),
         ("unknown", unary("Frobnicate", FLOAT32, &[1]), "Frobnicate"),
         (
@@ -43,7 +47,7 @@ fn models_that_cannot_run_are_refused_with_the_reason_and_others_go_on() {
         ("outside", model(&outside), "tensor `w` is in another file, `weights.bin`"),
         ("new", model_with_opset(&graph(&[], &[], &inputs(), &outputs()), 99), "version 99"),
         ("int16", unary("Identity", INT16, &[1]), "int16, which rten does not support"),
-        ("cut", product()[..60].to_vec(), "it is no ONNX model"),
+        ("cut", product()[..60].to_vec(), "it is not an ONNX model"),
         (
             "missing",
             model(&graph(&[], &[], &inputs(), &[value("z", FLOAT32, &[1])])),
@@ -112,6 +116,6 @@ fn a_hostile_message_length_does_not_take_memory() {
     ];
     let nested = Proto::default().number(1, 8).message(7, &Proto(huge[9..].to_vec())).0;
     for (name, bytes) in [("huge", huge.to_vec()), ("nested", nested)] {
-        assert!(refusal(&program, granted(name, bytes)).contains("it is no ONNX model"));
+        assert!(refusal(&program, granted(name, bytes)).contains("it is not an ONNX model"));
     }
 }

@@ -2,11 +2,11 @@
 
 use gleaner_protocol::inference::{Element, ModelFaultKind, ModelState};
 
-use crate::onnx::{
+use crate::support::{ModelProgram, TestTensor, fault, floats, granted, integers};
+use gleaner_test_support::onnx::{
     ANY, BOOL, FLOAT32, FLOAT64, INT8, INT64, Proto, UINT8, doubled, graph, model, node, number_of,
     product, unary, value, value_of,
 };
-use crate::support::{ModelProgram, TestTensor, fault, floats, granted, integers};
 
 #[test]
 fn a_model_is_opened_and_run_with_any_batch() {

@@ -7,9 +7,11 @@ use gleaner_protocol::inference::{
     InferenceReport, ModelCall, ModelFaultKind, ModelMemory, ModelWait,
 };
 
-use crate::onnx::{ANY, FLOAT32, constant, endless, graph, model, node, product, unary, value};
 use crate::support::{
     ModelProgram, ModelUser, TestModel, digest, fault, floats, granted, in_future, wait_for,
+};
+use gleaner_test_support::onnx::{
+    ANY, FLOAT32, constant, endless, graph, model, node, product, unary, value,
 };
 
 /// A model that takes some ms for 8 products of large matrices.

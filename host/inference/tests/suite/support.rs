@@ -18,8 +18,8 @@ use gleaner_protocol::inference::{
 };
 use sha2::{Digest, Sha256};
 
-use crate::onnx::product;
-use crate::shared_data::shared_file;
+use gleaner_test_support::onnx::product;
+use gleaner_test_support::shared_file;
 
 /// Time after which an awaited event is missing.
 pub const TIMEOUT: Duration = Duration::from_secs(60);

@@ -5,9 +5,9 @@ use std::path::PathBuf;
 use clap::{Parser, Subcommand};
 use gleaner_dds::NetworkArgs;
 use gleaner_drives::journals_of;
-use gleaner_jail::Paths;
-use gleaner_jail::ingress::NewSockets;
-use gleaner_transport::Clock;
+use gleaner_messages::transport::Clock;
+use gleaner_sandbox::Paths;
+use gleaner_sandbox::ingress::NewSockets;
 
 use super::topics::TopicsArgs;
 

@@ -17,12 +17,12 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use gleaner_base::{Exit, Failure};
-use gleaner_jail::ingress as sandbox;
 use gleaner_protocol::Handover;
 use gleaner_protocol::ingress::IngressServer;
-use gleaner_regions::TopicRegion;
-use gleaner_vitals::start::{reports, stop_socket};
-use gleaner_vitals::{ReportWriter, log};
+use gleaner_protocol::process_stats::start::{reports, stop_socket};
+use gleaner_protocol::process_stats::{ReportWriter, log};
+use gleaner_samples::regions::TopicRegion;
+use gleaner_sandbox::ingress as sandbox;
 use rustix::process::{Signal, set_parent_process_death_signal};
 use tracing::warn;
 
@@ -72,7 +72,7 @@ fn start(args: Args) -> Result<(), Failure> {
     // A starter that dies also closes the control connection.
     set_parent_process_death_signal(Some(Signal::TERM))
         .map_err(io::Error::from)
-        .map_err(internal("cannot watch for the starter's death by `prctl`"))?;
+        .map_err(internal("cannot watch for the parent process's death by `prctl`"))?;
     let stop = stop_socket().map_err(internal("cannot handle SIGTERM"))?;
     let control = control()?;
     let reports = reports().map_err(internal("cannot set up the report stream"))?;

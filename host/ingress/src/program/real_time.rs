@@ -14,13 +14,13 @@ use libc::c_int;
 const PRIORITY: c_int = 1;
 /// Freed memory at the end of the heap that is so large is given back to the system, except `KEPT`.
 #[cfg(target_env = "gnu")]
-const LEAST_TRIMMED: c_int = 512 << 20;
+const MIN_TRIMMED: c_int = 512 << 20;
 /// As much as topics map before their first sample.
 #[cfg(target_env = "gnu")]
-const KEPT: c_int = gleaner_dds::MOST_MAPPED as c_int;
+const KEPT: c_int = gleaner_dds::MAX_MAPPED as c_int;
 /// Blocks of this size and larger are not kept. Some versions of glibc accept no larger number.
 #[cfg(target_env = "gnu")]
-const LEAST_MAPPED: c_int = 32 << 20;
+const MIN_MAPPED: c_int = 32 << 20;
 
 /// Gives this thread, and those that it starts from now on, real-time priority, and lets the
 /// allocator keep freed memory.
@@ -43,8 +43,8 @@ fn keep_memory() {
     #[cfg(target_env = "gnu")]
     for (parameter, value) in [
         (libc::M_ARENA_MAX, 1),
-        (libc::M_MMAP_THRESHOLD, LEAST_MAPPED),
-        (libc::M_TRIM_THRESHOLD, LEAST_TRIMMED),
+        (libc::M_MMAP_THRESHOLD, MIN_MAPPED),
+        (libc::M_TRIM_THRESHOLD, MIN_TRIMMED),
         (libc::M_TOP_PAD, KEPT),
     ] {
         // SAFETY: `mallopt` takes two numbers by value and locks what it changes. It fails only

@@ -3,7 +3,7 @@
 use gleaner_base::Failure;
 use gleaner_dds::Dds;
 use gleaner_drives::{DriveOptions, DrivePlayer, ReplayError};
-use gleaner_transport::LiveSource;
+use gleaner_messages::transport::LiveSource;
 
 use super::args::Args;
 use super::network::{NetworkError, warn_of_variables};

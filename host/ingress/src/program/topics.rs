@@ -8,7 +8,7 @@ use clap::Args;
 use gleaner_base::{Exit, Failure};
 use gleaner_dds::{Dds, NetworkArgs};
 use gleaner_protocol::ingress::{IngressReport, TopicInfo};
-use gleaner_vitals::start::stop_socket;
+use gleaner_protocol::process_stats::start::stop_socket;
 use rustix::process::{Signal, set_parent_process_death_signal};
 
 use super::network::{NetworkError, warn_of_variables};

@@ -5,12 +5,12 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use gleaner_messages::Definitions;
-use gleaner_protocol::ingress::TopicGrant;
-use gleaner_transport::loopback::Loopback;
-use gleaner_transport::{
+use gleaner_messages::transport::loopback::Loopback;
+use gleaner_messages::transport::{
     DefinitionsSearch, DiscoveredTopic, Health, LiveSource, PublishError, Publisher, Sink,
     Subscription, TopicSpec, Transport, TransportError,
 };
+use gleaner_protocol::ingress::TopicGrant;
 
 use crate::support::{RunningIngress, TIMEOUT, TYPE, grant};
 

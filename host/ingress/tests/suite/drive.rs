@@ -5,9 +5,9 @@ use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
 use gleaner_drives::{DriveOptions, DrivePlayer};
+use gleaner_messages::transport::StoredMeta;
+use gleaner_messages::transport::clock::Clock;
 use gleaner_protocol::ingress::{IngressReport, PublishGrant, RefusedTopic, TopicGrant};
-use gleaner_transport::StoredMeta;
-use gleaner_transport::clock::Clock;
 use mcap::WriteOptions;
 use mcap::records::MessageHeader;
 use tempfile::TempDir;
@@ -110,7 +110,7 @@ fn a_drive_has_only_its_own_topics() {
         (2, missing),
     ] {
         match feed.topic(id, TIMEOUT) {
-            Err(gleaner_feed::FeedError::Refused { reason, .. }) => assert_eq!(reason, expected),
+            Err(gleaner_samples::FeedError::Refused { reason, .. }) => assert_eq!(reason, expected),
             other => panic!("{other:?}"),
         }
     }

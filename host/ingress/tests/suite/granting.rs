@@ -1,9 +1,9 @@
 //! Topics that are granted, refused, or found later.
 
 use gleaner_buffers::shared::HAZARDS;
-use gleaner_feed::{Feed, FeedError, FeedEvent};
-use gleaner_protocol::ingress::{AddReader, AddTopics, HoldGrant, RefusedTopic, TopicGrant};
-use gleaner_transport::loopback::Loopback;
+use gleaner_messages::transport::loopback::Loopback;
+use gleaner_protocol::ingress::{AddReader, AddTopics, PinGrant, RefusedTopic, TopicGrant};
+use gleaner_samples::{Feed, FeedError, FeedEvent};
 
 use crate::support::{Numbers, RunningIngress, TEXT, TIMEOUT, TYPE, grant, meta, wait_for};
 
@@ -46,7 +46,7 @@ fn refusals_name_the_topic_or_the_type() {
 
 /// Returns a grant of a topic with words for `singles` samples.
 fn holding(id: u32, topic: &str, singles: u16) -> TopicGrant {
-    TopicGrant { holds: HoldGrant { windows: 0, window: 0, singles }, ..grant(id, topic) }
+    TopicGrant { holds: PinGrant { windows: 0, window: 0, singles }, ..grant(id, topic) }
 }
 
 #[test]

@@ -9,7 +9,7 @@ use std::os::unix::net::UnixStream;
 use gleaner_buffers::shared::ControlMemory;
 use gleaner_protocol::ingress::{IngressLink, ReaderMessage};
 use gleaner_protocol::link::Incoming;
-use gleaner_regions::ControlRegion;
+use gleaner_samples::regions::ControlRegion;
 
 use crate::support::{RunningIngress, grant, wait_for};
 

@@ -7,12 +7,12 @@ use std::os::unix::net::UnixStream;
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::mpsc::{Receiver, channel};
 
-use gleaner_feed::Feed;
+use gleaner_messages::transport::StoredMeta;
 use gleaner_protocol::Handover;
 use gleaner_protocol::ingress::{
-    AddReader, HoldGrant, IngressControl, IngressReport, IngressStatus, TopicGrant,
+    AddReader, IngressControl, IngressReport, IngressStatus, PinGrant, TopicGrant,
 };
-use gleaner_transport::StoredMeta;
+use gleaner_samples::Feed;
 
 use crate::support::{TIMEOUT, grant};
 
@@ -89,7 +89,7 @@ fn imu(id: u32, depth: u32) -> TopicGrant {
         queue: 100,
         max_bytes: Some(4096),
         depth,
-        holds: HoldGrant { windows: 2, window: 16, singles: 4 },
+        holds: PinGrant { windows: 2, window: 16, singles: 4 },
         digests: true,
         ..grant(id, "/imu/data")
     }

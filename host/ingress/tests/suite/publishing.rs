@@ -1,7 +1,7 @@
 //! Topics that readers publish.
 
-use gleaner_feed::Feed;
 use gleaner_protocol::ingress::PublishGrant;
+use gleaner_samples::Feed;
 
 use crate::support::{RunningIngress, TYPE, collect, grant, wait_for};
 

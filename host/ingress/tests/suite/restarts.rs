@@ -2,9 +2,9 @@
 
 use std::os::unix::net::UnixStream;
 
-use gleaner_feed::{FedTopic, FeedEvent, LastingFeed};
+use gleaner_messages::transport::StoredMeta;
 use gleaner_protocol::Handover;
-use gleaner_transport::StoredMeta;
+use gleaner_samples::{FeedEvent, ReconnectingReader, SharedTopicReader};
 
 use crate::support::{RunningIngress, TEXT, TYPE, grant, wait_for};
 
@@ -13,7 +13,7 @@ fn an_ingress_that_ended_before_it_was_joined_leaves_its_samples_to_the_reader()
     let (mut numbers, mut ingress) = RunningIngress::of_numbers("/number");
     let feed = ingress.reader("reader", vec![grant(0, "/number")]);
     let (starter, handover) = UnixStream::pair().unwrap();
-    let mut feed = LastingFeed::new(feed, Some(handover.into()));
+    let mut feed = ReconnectingReader::new(feed, Some(handover.into()));
     let mut readings = vec![attached(&mut feed)];
     let mut published = numbers.publish_all(3);
     // The reader looks at neither of the next two before both have ended.
@@ -34,7 +34,7 @@ fn an_ingress_that_ended_before_it_was_joined_leaves_its_samples_to_the_reader()
 }
 
 /// Waits until the topic is attached.
-fn attached(feed: &mut LastingFeed) -> FedTopic {
+fn attached(feed: &mut ReconnectingReader) -> SharedTopicReader {
     wait_for(|| {
         feed.poll().unwrap().into_iter().find_map(|event| match event {
             FeedEvent::Attached(topic) => Some(topic),
@@ -44,7 +44,7 @@ fn attached(feed: &mut LastingFeed) -> FedTopic {
 }
 
 /// Returns the sequence numbers of the samples of a topic.
-fn numbers_of(topic: &FedTopic) -> Vec<u64> {
+fn numbers_of(topic: &SharedTopicReader) -> Vec<u64> {
     let positions = topic.info.first..topic.reader.head();
     let number = |position| {
         let sample = topic.reader.get(position).unwrap().unwrap();

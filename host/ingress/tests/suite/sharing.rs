@@ -3,8 +3,8 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use gleaner_messages::transport::{Delivery, Qos, StoredMeta, TopicCounters};
 use gleaner_protocol::ingress::TopicGrant;
-use gleaner_transport::{Delivery, Qos, StoredMeta, TopicCounters};
 
 use crate::support::{RunningIngress, collect, grant, wait_for};
 

@@ -6,13 +6,13 @@ use std::sync::mpsc::{Receiver, channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use gleaner_feed::{FedTopic, Feed};
 use gleaner_ingress::Ingress;
+use gleaner_messages::transport::loopback::Loopback;
+use gleaner_messages::transport::{Delivery, Guid, LiveSource, SampleMeta, StoredMeta};
 use gleaner_protocol::ingress::{
-    AddReader, HoldGrant, IngressControl, IngressReport, IngressStatus, PublishGrant, TopicGrant,
+    AddReader, IngressControl, IngressReport, IngressStatus, PinGrant, PublishGrant, TopicGrant,
 };
-use gleaner_transport::loopback::Loopback;
-use gleaner_transport::{Delivery, Guid, LiveSource, SampleMeta, StoredMeta};
+use gleaner_samples::{Feed, SharedTopicReader};
 
 /// Time after which an awaited event is missing.
 pub const TIMEOUT: Duration = Duration::from_secs(60);
@@ -114,7 +114,7 @@ impl Drop for RunningIngress {
 /// A reader of one topic, at a position.
 pub struct Reading {
     pub feed: Feed,
-    pub topic: FedTopic,
+    pub topic: SharedTopicReader,
     pub next: u64,
 }
 
@@ -184,7 +184,7 @@ pub fn grant(id: u32, topic: &str) -> TopicGrant {
         queue: 8,
         max_bytes: Some(64),
         depth: 64,
-        holds: HoldGrant { windows: 1, window: 8, singles: 4 },
+        holds: PinGrant { windows: 1, window: 8, singles: 4 },
         wakes: true,
         ..TopicGrant::default()
     }

@@ -1,6 +1,5 @@
 //! Tests the crate through its public interface: definitions, fields, and sources of definitions.
 
+mod loopback;
 mod messages;
 mod sources;
-#[path = "../../../drives/tests/suite/support.rs"]
-mod support;

@@ -3,13 +3,58 @@
 use std::sync::Arc;
 
 use gleaner_drives::Replay;
+use gleaner_messages::transport::Transport;
 use gleaner_messages::{
     CdrError, CompressedView, Definitions, Endian, FieldPath, ImageView, MessageValue, PathError,
     ValueKind, header_stamp,
 };
-use gleaner_transport::Transport;
+use gleaner_test_support::drives::sample_drive;
 
-use crate::support::{CdrBytes, sample_drive};
+macro_rules! numbers {
+    ($($name:ident)*) => {$(
+        fn $name(self, value: $name) -> Self {
+            self.put(value.to_le_bytes())
+        }
+    )*};
+}
+
+/// Writes CDR as a ROS 2 node does, implemented independently of the parser under test.
+struct CdrBytes {
+    bytes: Vec<u8>,
+    endian: Endian,
+}
+
+impl CdrBytes {
+    fn new(endian: Endian) -> Self {
+        Self { bytes: Vec::new(), endian }
+    }
+
+    fn put<const N: usize>(mut self, mut little: [u8; N]) -> Self {
+        while !self.bytes.len().is_multiple_of(N) {
+            self.bytes.push(0xAA);
+        }
+        if self.endian == Endian::Big {
+            little.reverse();
+        }
+        self.bytes.extend(little);
+        self
+    }
+
+    numbers! { u8 i16 u16 i32 u32 i64 f32 f64 }
+
+    fn text(self, value: &str) -> Self {
+        let mut cdr = self.u32(value.len() as u32 + 1);
+        cdr.bytes.extend(value.as_bytes());
+        cdr.bytes.push(0);
+        cdr
+    }
+
+    fn blob(self, value: &[u8]) -> Self {
+        let mut cdr = self.u32(value.len() as u32);
+        cdr.bytes.extend(value);
+        cdr
+    }
+}
 
 const MIXED: &str = "\
 bool flag

@@ -6,10 +6,10 @@ use std::slice;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use gleaner_drives::Replay;
+use gleaner_messages::transport::Transport;
 use gleaner_messages::{Definitions, FieldPath, Sources, SourcesError};
-use gleaner_transport::Transport;
 
-use super::support::sample_drive;
+use gleaner_test_support::drives::sample_drive;
 
 struct DefinitionsFolder(PathBuf);
 

@@ -1,5 +1,5 @@
 //! The statements of a clip about itself: its line in the list, and the metadata records in the
-//! file. `stated` checks them against the content, by building the records again.
+//! file. `claims` checks them against the content, by building the records again.
 
 use std::collections::{BTreeMap, HashSet};
 use std::fmt::Display;

@@ -89,11 +89,7 @@ impl RecordingFolder {
         std::mem::take(&mut self.unfinished)
     }
 
-    /// Replaces the listed clips as [`EarlierClips::replace`] does.
-    ///
-    /// # Errors
-    ///
-    /// As for [`EarlierClips::replace`].
+    /// Replaces the listed clips as [`EarlierClips::replace`] does, with its errors.
     pub fn replace(&mut self, keep: &[Clip]) -> Result<u64, RecordError> {
         self.earlier().replace(keep)
     }
@@ -141,10 +137,7 @@ impl RecordingFolder {
         self.retention.as_mut().map_or(Vec::new(), |retention| retention.add(&self.dir, clip))
     }
 
-    /// Begins a clip named `base`, or `base-2`, `base-3` and so on if the name is taken.
-    ///
-    /// # Errors
-    ///
+    /// Begins a clip named `base`, or `base-2`, `base-3` and so on if the name is taken;
     /// [`RecordError`] if its file cannot be created or written.
     pub(crate) fn begin(
         &mut self,

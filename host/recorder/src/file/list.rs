@@ -55,7 +55,7 @@ impl ClipList {
             warn!(
                 path = %self.path.display(),
                 bytes = len - whole,
-                "truncated a torn last line of the list"
+                "removed an incomplete last line of clips.jsonl"
             );
             file.set_len(whole).and_then(|()| file.sync_all()).map_err(failed)?;
         }
@@ -142,7 +142,7 @@ pub(super) fn read_lines(
         too_long = false;
     }
     if malformed > 0 {
-        warn!(malformed, "lines of clips.jsonl that name no clip of this program are kept");
+        warn!(malformed, "kept lines of clips.jsonl that do not name a clip of this program");
     }
     Ok((listed, whole, at))
 }

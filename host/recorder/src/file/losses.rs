@@ -22,11 +22,8 @@ impl LossList {
         LossList { path: folder.join("losses.jsonl"), turn: Mutex::default() }
     }
 
-    /// Appends a line and syncs it. After an error the list is unchanged.
-    ///
-    /// # Errors
-    ///
-    /// [`RecordError::Write`]
+    /// Appends a line and syncs it. After an error, [`RecordError::Write`], the list is
+    /// unchanged.
     pub fn note(&self, loss: &Loss) -> Result<(), RecordError> {
         let failed = |source| RecordError::Write { path: self.path.clone(), source };
         let mut line = serde_json::to_vec(loss).expect("a loss is plain data");

@@ -24,6 +24,7 @@
 //! by [`EarlierClips::replace`] and, before they are fetched, by
 //! [`RecordingFolder::keep_at_most`].
 
+mod claims;
 mod clip_dir;
 mod clip_records;
 mod durable;
@@ -37,9 +38,8 @@ mod replaced;
 mod retention;
 mod signing;
 mod sink;
-mod stated;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 mod unfinished;
 mod written;
 
@@ -48,11 +48,11 @@ use std::sync::Arc;
 use gleaner_journal::JournalHeader;
 use gleaner_lambda::{ClipLambda, Moment};
 
+pub use claims::{ClaimMismatch, ClipStatements};
 pub(crate) use clip_dir::names;
 pub(crate) use clip_records::CONTINUES;
 pub use folder::{EarlierClips, RecordingFolder};
 pub use losses::LossList;
-pub use stated::{ClipStatements, FalseStatement};
 pub use unfinished::MESSAGE_MAX;
 pub(crate) use unfinished::UnfinishedClip;
 

@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use gleaner_drives::{Damage, DamageLocation, DriveLimits, Replay, ReplayError, read_extras};
 use gleaner_lambda::Clip;
-use gleaner_transport::{Delivery, SampleMeta, TopicSpec, Transport};
+use gleaner_messages::transport::{Delivery, SampleMeta, TopicSpec, Transport};
 
 use super::clip_records::{BEGIN, CLIP_RECORD, read_begin, read_line, read_recovered_from};
 use super::recover::Pause;
@@ -45,7 +45,7 @@ impl ClipReader {
                 qos: Default::default(),
             };
             replay
-                .subscribe(&spec, Arc::clone(&last) as Arc<dyn gleaner_transport::Sink>)
+                .subscribe(&spec, Arc::clone(&last) as Arc<dyn gleaner_messages::transport::Sink>)
                 .map_err(|source| RecordError::Topic {
                     path: path.to_owned(),
                     source: Box::new(source),
@@ -120,7 +120,7 @@ fn unreadable(path: &Path) -> impl Fn(ReplayError) -> RecordError + '_ {
 #[derive(Default)]
 struct LastMessage(Mutex<Vec<u8>>);
 
-impl gleaner_transport::Sink for LastMessage {
+impl gleaner_messages::transport::Sink for LastMessage {
     fn deliver(&self, _: &SampleMeta, cdr: &[u8]) -> Delivery {
         let mut last = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         last.clear();

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use gleaner_lambda::{Clip, Recovered};
-use gleaner_transport::{Guid, SampleMeta};
+use gleaner_messages::transport::{Guid, SampleMeta};
 use gleaner_trust::{ClipSigner, ClipStatement};
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{Attachment, Compression, McapError, WriteOptions, Writer};
@@ -200,10 +200,7 @@ impl UnfinishedClip {
     }
 
     /// Gives `topic` a channel if it has none: it was recorded, but had no message.
-    ///
-    /// # Errors
-    ///
-    /// As [`UnfinishedClip::message`].
+    /// Errors as of [`UnfinishedClip::message`].
     pub fn declare(&mut self, topic: &TopicSchema) -> Result<(), RecordError> {
         if self.channels.by_topic.contains_key(&topic.name) {
             return Ok(());
@@ -214,11 +211,7 @@ impl UnfinishedClip {
     }
 
     /// Closes the open chunk: its content survives a crash of this process. Called internally at
-    /// least for every second of messages.
-    ///
-    /// # Errors
-    ///
-    /// As [`UnfinishedClip::message`].
+    /// least for every second of messages. Errors as of [`UnfinishedClip::message`].
     pub fn flush(&mut self) -> Result<(), RecordError> {
         self.chunk = None;
         self.with_writer(Writer::flush)?;
@@ -262,22 +255,7 @@ impl UnfinishedClip {
             self.metadata(name, metadata)?;
         }
         let signing = dir.signer().and_then(|signer| self.statement(signer, &trailer, &clip));
-        for (lambda, journal) in trailer.journals {
-            self.attach(
-                clip_records::journal(&lambda),
-                "application/octet-stream",
-                journal,
-                trailer.to_ns,
-            )?;
-        }
-        if let Some(jpeg) = trailer.thumbnail {
-            self.attach(THUMBNAIL.to_owned(), "image/jpeg", jpeg, trailer.to_ns)?;
-        }
-        if let Some((_, _, length)) = signing {
-            self.hold.store(true, Ordering::Relaxed);
-            let (name, media_type) = signing::ATTACHMENT;
-            self.attach(name.to_owned(), media_type, vec![b' '; length], trailer.to_ns)?;
-        }
+        self.attach_all(trailer, signing.as_ref().map(|(_, _, length)| *length))?;
         self.with_writer(|writer| writer.finish().map(drop))?;
         let cannot_sync = |source| RecordError::Sync { path: self.path.clone(), source };
         let sink = self
@@ -298,6 +276,28 @@ impl UnfinishedClip {
         durable::rename(&self.path, &dir.path(name, CLIP), dir.folder())?;
         dir.add(name, &clip)?;
         Ok(clip)
+    }
+
+    /// Attaches journals and thumbnail, and room for an envelope of `signature` bytes.
+    fn attach_all(
+        &mut self,
+        trailer: ClipTrailer,
+        signature: Option<usize>,
+    ) -> Result<(), RecordError> {
+        let at_ns = trailer.to_ns;
+        for (lambda, journal) in trailer.journals {
+            let name = clip_records::journal(&lambda);
+            self.attach(name, "application/octet-stream", journal, at_ns)?;
+        }
+        if let Some(jpeg) = trailer.thumbnail {
+            self.attach(THUMBNAIL.to_owned(), "image/jpeg", jpeg, at_ns)?;
+        }
+        if let Some(length) = signature {
+            self.hold.store(true, Ordering::Relaxed);
+            let (name, media_type) = signing::ATTACHMENT;
+            self.attach(name.to_owned(), media_type, vec![b' '; length], at_ns)?;
+        }
+        Ok(())
     }
 
     /// Returns the statement to sign, and the length of its envelope; `None` if it cannot be
@@ -370,21 +370,13 @@ impl UnfinishedClip {
     ) -> Result<ClipChannel, RecordError> {
         let is_full = self.channels.count >= CHANNELS_MAX;
         if let Some(known) = self.channels.by_topic.get(&topic.name) {
-            let channel_of = |key| {
-                known.by_writer.get(&key).map(|id| ClipChannel {
-                    index: known.index,
-                    id: *id,
-                    new_bytes: 0,
-                })
-            };
-            if let Some(found) = channel_of(key) {
-                return Ok(found);
-            }
-            if is_full {
+            let mut id = known.by_writer.get(&key);
+            if id.is_none() && is_full {
                 key.writer = None;
-                if let Some(found) = channel_of(key) {
-                    return Ok(found);
-                }
+                id = known.by_writer.get(&key);
+            }
+            if let Some(id) = id {
+                return Ok(ClipChannel { index: known.index, id: *id, new_bytes: 0 });
             }
         }
         let mut metadata = BTreeMap::new();

@@ -4,7 +4,7 @@
 use std::collections::{BTreeSet, HashMap};
 
 use gleaner_messages::Endian;
-use gleaner_transport::SampleMeta;
+use gleaner_messages::transport::SampleMeta;
 
 use super::TopicSchema;
 
@@ -114,7 +114,7 @@ fn checksum(meta: &SampleMeta, cdr: &[u8]) -> u32 {
 
 #[cfg(test)]
 mod tests {
-    use gleaner_transport::Guid;
+    use gleaner_messages::transport::Guid;
 
     use super::*;
 

@@ -10,24 +10,24 @@ const STAMPS_MAX: usize = 4096;
 #[derive(Debug, Default)]
 pub struct Losses {
     /// Evicted for lack of room.
-    pub overwritten: Gone,
+    pub overwritten: LossStamps,
     /// Larger than the store.
-    pub too_big: Gone,
+    pub too_big: LossStamps,
     /// Dropped as older than any window reaches, unless its trigger comes late.
     pub aged: Horizon,
     /// Lost before the recorder, at the stamps of the next sample.
-    pub lost: Gone,
+    pub lost: LossStamps,
 }
 
 /// Stamps of the losses of one cause.
 #[derive(Debug, Default)]
-pub struct Gone {
+pub struct LossStamps {
     /// Stamp, the group whose clips have it, and the number lost at once.
     stamps: VecDeque<(i64, u64, u64)>,
     forgotten: Horizon,
 }
 
-impl Gone {
+impl LossStamps {
     /// Adds a loss with the stamp `at`; it is in the clips of group `group`, 0 for none.
     pub fn add(&mut self, at: i64, group: u64) {
         self.add_some(at, group, 1);
@@ -114,7 +114,7 @@ mod tests {
 
     #[test]
     fn losses_are_counted_once_for_each_group_of_windows() {
-        let mut gone = Gone::default();
+        let mut gone = LossStamps::default();
         for at in 0..10 {
             gone.add(at, if at < 3 { 7 } else { 0 });
         }
@@ -126,7 +126,7 @@ mod tests {
 
     #[test]
     fn losses_beyond_the_kept_stamps_are_unknown() {
-        let mut gone = Gone::default();
+        let mut gone = LossStamps::default();
         for at in 0..STAMPS_MAX as i64 + 10 {
             gone.add(at, 0);
         }

@@ -12,7 +12,7 @@ use std::path::PathBuf;
 
 use gleaner_lambda::manifest::Store;
 use gleaner_messages::Endian;
-use gleaner_transport::{Guid, SampleMeta};
+use gleaner_messages::transport::{Guid, SampleMeta};
 
 pub use losses::Losses;
 
@@ -124,13 +124,13 @@ pub struct EntryId(u64);
 /// An entry that a reader has come to. Unlike an [`EntryId`] it may be kept while the store
 /// changes.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
-pub struct Walked {
+pub struct PrerollCursor {
     place: EntryId,
     /// Number of all entries before it, including dropped ones.
     number: u64,
 }
 
-impl Walked {
+impl PrerollCursor {
     /// Returns the ID of the entry, which is valid until the store changes.
     pub fn place(self) -> EntryId {
         self.place
@@ -147,6 +147,16 @@ pub struct Preroll {
 enum PrerollStore {
     Ram(Ram),
     Disk(Disk),
+}
+
+/// Does the same with either store.
+macro_rules! each {
+    ($kind:expr, $store:ident => $act:expr) => {
+        match $kind {
+            PrerollStore::Ram($store) => $act,
+            PrerollStore::Disk($store) => $act,
+        }
+    };
 }
 
 impl Preroll {
@@ -176,7 +186,7 @@ impl Preroll {
     }
 
     /// Raises the bound to `bytes`, and moves to disk if `store` is the disk. Entries are kept, but
-    /// may move: `true` means that every [`Walked`] is invalid.
+    /// may move: `true` means that every [`PrerollCursor`] is invalid.
     ///
     /// # Errors
     ///
@@ -209,10 +219,7 @@ impl Preroll {
     }
 
     /// Adds an entry; the oldest are dropped to make room and passed to `gone`. On a full disk the
-    /// new entry itself may be. Returns `false` if it is larger than the store.
-    ///
-    /// # Errors
-    ///
+    /// new entry itself may be. Returns `false` if it is larger than the store;
     /// [`RecordError::Preroll`] if the disk fails.
     pub fn push(
         &mut self,
@@ -243,10 +250,7 @@ impl Preroll {
         }
     }
 
-    /// Drops entries older than `before`, from the oldest on, and passes them to `aged`.
-    ///
-    /// # Errors
-    ///
+    /// Drops entries older than `before`, from the oldest on, and passes them to `aged`;
     /// [`RecordError::Preroll`] if the disk fails.
     pub fn trim(
         &mut self,
@@ -268,62 +272,39 @@ impl Preroll {
     }
 
     /// Returns the entry after `last`, or the oldest if `last` was dropped or is `None`.
-    pub fn next(&self, last: Option<Walked>) -> Option<Walked> {
+    pub fn next(&self, last: Option<PrerollCursor>) -> Option<PrerollCursor> {
         match last {
-            Some(Walked { place, number }) if number >= self.gone => {
-                self.after(place).map(|place| Walked { place, number: number + 1 })
+            Some(PrerollCursor { place, number }) if number >= self.gone => {
+                let next = each!(&self.kind, store => store.after(place));
+                next.map(|place| PrerollCursor { place, number: number + 1 })
             }
-            _ => self.oldest().map(|place| Walked { place, number: self.gone }),
+            _ => {
+                let oldest = each!(&self.kind, store => store.oldest());
+                oldest.map(|place| PrerollCursor { place, number: self.gone })
+            }
         }
     }
 
-    pub fn newest(&self) -> Option<Walked> {
-        let (place, entries) = match &self.kind {
-            PrerollStore::Ram(ram) => (ram.newest()?, ram.entries()),
-            PrerollStore::Disk(disk) => (disk.newest()?, disk.entries()),
-        };
-        Some(Walked { place, number: (self.gone + entries).saturating_sub(1) })
+    pub fn newest(&self) -> Option<PrerollCursor> {
+        let (place, entries) = each!(&self.kind, store => (store.newest()?, store.entries()));
+        Some(PrerollCursor { place, number: (self.gone + entries).saturating_sub(1) })
     }
 
     /// Returns the ID of an entry, unless it was dropped.
-    pub fn find(&self, walked: Walked) -> Option<EntryId> {
+    pub fn find(&self, walked: PrerollCursor) -> Option<EntryId> {
         (walked.number >= self.gone).then_some(walked.place)
     }
 
     /// Returns whether an entry of `len` bytes fits, once others are dropped.
     pub fn fits(&self, len: usize) -> bool {
-        match &self.kind {
-            PrerollStore::Ram(ram) => ram.fits(len),
-            PrerollStore::Disk(disk) => disk.fits(len),
-        }
-    }
-
-    fn oldest(&self) -> Option<EntryId> {
-        match &self.kind {
-            PrerollStore::Ram(ram) => ram.oldest(),
-            PrerollStore::Disk(disk) => disk.oldest(),
-        }
-    }
-
-    fn after(&self, place: EntryId) -> Option<EntryId> {
-        match &self.kind {
-            PrerollStore::Ram(ram) => ram.after(place),
-            PrerollStore::Disk(disk) => disk.after(place),
-        }
+        each!(&self.kind, store => store.fits(len))
     }
 
     pub fn held(&self, place: EntryId) -> EntryMeta {
-        match &self.kind {
-            PrerollStore::Ram(ram) => ram.held(place),
-            PrerollStore::Disk(disk) => disk.held(place),
-        }
+        each!(&self.kind, store => store.held(place))
     }
 
-    /// Returns the bytes of an entry.
-    ///
-    /// # Errors
-    ///
-    /// [`RecordError::Preroll`] if the disk fails.
+    /// Returns the bytes of an entry; [`RecordError::Preroll`] if the disk fails.
     pub fn bytes(&mut self, place: EntryId) -> Result<&[u8], RecordError> {
         match &mut self.kind {
             PrerollStore::Ram(ram) => Ok(ram.bytes(place)),
@@ -333,18 +314,12 @@ impl Preroll {
 
     /// Marks an entry as written to the clips of a group of windows.
     pub fn mark(&mut self, place: EntryId, group: u64) {
-        match &mut self.kind {
-            PrerollStore::Ram(ram) => ram.mark(place, group),
-            PrerollStore::Disk(disk) => disk.mark(place, group),
-        }
+        each!(&mut self.kind, store => store.mark(place, group))
     }
 
     /// Returns the bytes in use, including the overhead of entries.
     pub fn bytes_held(&self) -> u64 {
-        match &self.kind {
-            PrerollStore::Ram(ram) => ram.bytes_held(),
-            PrerollStore::Disk(disk) => disk.bytes_held(),
-        }
+        each!(&self.kind, store => store.bytes_held())
     }
 
     pub fn bytes_highest(&self) -> u64 {

@@ -91,7 +91,7 @@ fn old_entries_are_dropped_and_marks_stay() {
         }
         let first = everything(&mut preroll)[0].0.at_ns;
         let mut next = preroll.next(None);
-        while let Some(place) = next.map(Walked::place) {
+        while let Some(place) = next.map(PrerollCursor::place) {
             let at = preroll.held(place).at_ns;
             preroll.mark(place, at as u64 % 5);
             next = preroll.next(next);

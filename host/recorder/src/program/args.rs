@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Parser;
 use gleaner_lambda::manifest::TopicName;
 use gleaner_messages::Sources;
-use gleaner_transport::Clock;
+use gleaner_messages::transport::Clock;
 use gleaner_trust::VehicleName;
 
 use super::RecorderOptions;

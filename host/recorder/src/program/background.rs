@@ -4,12 +4,13 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError};
+use std::thread::{Builder, JoinHandle};
 use std::time::{Duration, Instant};
 
 use gleaner_base::visible;
-use gleaner_feed::FeedBell;
 use gleaner_messages::Sources;
-use gleaner_vitals::usage;
+use gleaner_protocol::process_stats::usage;
+use gleaner_samples::Waker;
 use tracing::warn;
 
 use super::connections::LoopEvent;
@@ -33,13 +34,17 @@ pub struct Background {
     pub sources: Sources,
     pub requests: Receiver<DefinitionsRequest>,
     pub events: SyncSender<LoopEvent>,
-    pub bell: FeedBell,
+    pub bell: Waker,
     pub out: PathBuf,
 }
 
 impl Background {
-    /// Runs until the loop drops its ends of the channels.
-    pub fn run(self) {
+    /// Starts the thread, which runs until the loop drops its ends of the channels.
+    pub fn start(self) -> std::io::Result<JoinHandle<()>> {
+        Builder::new().name("background".to_owned()).spawn(move || self.run())
+    }
+
+    fn run(self) {
         let mut check_at = Instant::now() + HEALTH_INTERVAL;
         loop {
             let wait = check_at.saturating_duration_since(Instant::now());

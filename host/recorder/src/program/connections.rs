@@ -8,12 +8,12 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::Builder;
 
 use gleaner_base::{Exit, Failure, hex};
-use gleaner_feed::FeedBell;
 use gleaner_journal::{JournalEntry, JournalHeader};
 use gleaner_lambda::{BuildDir, Manifest};
 use gleaner_protocol::link::{
     AddLambda, ControlMessage, ControlServer, LambdaLink, LambdaMessage, LambdaReplies, LinkError,
 };
+use gleaner_samples::Waker;
 use sha2::{Digest, Sha256};
 use tracing::warn;
 
@@ -67,7 +67,7 @@ pub enum LambdaEvent {
 }
 
 /// Receives messages of the starter until it ends.
-pub fn starter(control: OwnedFd, events: SyncSender<LoopEvent>, bell: FeedBell) -> io::Result<()> {
+pub fn starter(control: OwnedFd, events: SyncSender<LoopEvent>, bell: Waker) -> io::Result<()> {
     Builder::new().name("starter".to_owned()).spawn(move || {
         let mut control = ControlServer::new(control);
         loop {
@@ -96,7 +96,7 @@ pub fn starter(control: OwnedFd, events: SyncSender<LoopEvent>, bell: FeedBell) 
     Ok(())
 }
 
-fn register(add: AddLambda, socket: OwnedFd, bell: &FeedBell) -> Option<Registration> {
+fn register(add: AddLambda, socket: OwnedFd, bell: &Waker) -> Option<Registration> {
     let lambda = add.lambda.display().to_string();
     let (link, mut replies) = match LambdaLink::new(socket) {
         Ok(both) => both,
@@ -132,7 +132,7 @@ fn read_link(
     mut link: LambdaLink,
     expected: &ExpectedLambda,
     inbox: &SyncSender<LambdaEvent>,
-    bell: &FeedBell,
+    bell: &Waker,
 ) {
     loop {
         let event = match link.receive() {
@@ -166,8 +166,9 @@ impl ExpectedLambda {
     fn differs(&self, header: &JournalHeader) -> Option<String> {
         let lambda = &self.manifest.lambda;
         let text = |what: &str, wanted: &str, found: &str| {
-            (wanted != found)
-                .then(|| format!("its {what} is `{found}`; the starter announced `{wanted}`"))
+            (wanted != found).then(|| {
+                format!("its {what} is `{found}`; the parent process announced `{wanted}`")
+            })
         };
         let manifest = header.files.iter().find(|file| file.path == "lambda.toml");
         text("name", lambda.name.as_str(), &header.lambda)
@@ -179,11 +180,13 @@ impl ExpectedLambda {
             })
             .or_else(|| {
                 let is_other = header.remaps != self.remaps;
-                is_other.then(|| "its topics are not remapped as the starter announced".to_owned())
+                is_other.then(|| {
+                    "its topics are not remapped as the parent process announced".to_owned()
+                })
             })
             .or_else(|| {
                 let limits =
-                    header.limits.in_words().into_iter().zip(self.manifest.limits.in_words());
+                    header.limits.describe().into_iter().zip(self.manifest.limits.describe());
                 limits.into_iter().find_map(|((key, found), (_, wanted))| {
                     text(&format!("limit `{key}`"), &wanted, &found)
                 })

@@ -5,15 +5,16 @@ use std::fs::File;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, channel, sync_channel};
-use std::thread::Builder;
+use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Failure};
-use gleaner_feed::{Feed, FeedBell, LastingFeed};
 use gleaner_lambda::manifest::Store;
+use gleaner_messages::transport::Clock;
 use gleaner_protocol::RecordingCounts;
-use gleaner_protocol::link::{COMMANDS_ID, RecorderReport, RecorderStatus};
-use gleaner_transport::Clock;
+use gleaner_protocol::ingress::COMMANDS_ID;
+use gleaner_protocol::link::{RecorderReport, RecorderStatus};
+use gleaner_samples::{Feed, ReconnectingReader, Waker};
 use tracing::warn;
 
 use super::background::{Background, SystemHealth};
@@ -25,7 +26,7 @@ use super::status::Reporter;
 use super::topics::Topics;
 use super::{RecorderConnections, RecorderOptions};
 use crate::recorder::counted;
-use crate::{Recorder, RecorderCounts, RecordingFolder, Settings, Work};
+use crate::{RecordError, Recorder, RecorderCounts, RecordingFolder, Settings, Work};
 
 /// Maximum number of events that are queued for the loop.
 const EVENTS: usize = 256;
@@ -60,6 +61,44 @@ pub fn run(
     reports: File,
     stop: Arc<AtomicBool>,
 ) -> Result<(), Failure> {
+    let (mut recorder_loop, background) = start(options, connections, reports, stop)?;
+    let ended = recorder_loop.run();
+    let counts = recorder_loop.recorder.counts();
+    let last = RecorderStatus {
+        trigger_to_open: recorder_loop.roster.spreads().all(),
+        ..recorder_loop.status(&counts)
+    };
+    // A thread that waits for room in the inbox would never end.
+    drop((recorder_loop.topics, recorder_loop.inbox));
+    recorder_loop.reporter.end(RecorderReport::Ended(Box::new(last)));
+    let _ = background.join();
+    ended
+}
+
+fn live_recorder(
+    folder: RecordingFolder,
+    options: &RecorderOptions,
+) -> Result<Recorder, RecordError> {
+    let settings = Settings {
+        store: Store::Ram,
+        preroll_bytes: options.preroll_bytes.unwrap_or(1 << 20),
+        max_length: Duration::from_secs(1),
+        folder: options.out.clone(),
+        clock: options.clock.to_string(),
+        prefault: true,
+    };
+    let mut recorder = Recorder::live(folder, settings)?;
+    recorder.advance(options.clock.now())?;
+    Ok(recorder)
+}
+
+/// Starts the threads of the process; returns the loop, and the background thread.
+fn start(
+    options: RecorderOptions,
+    connections: RecorderConnections,
+    reports: File,
+    stop: Arc<AtomicBool>,
+) -> Result<(RecorderLoop, JoinHandle<()>), Failure> {
     let internal =
         |error: std::io::Error| Failure::caused_by(Exit::Internal, "cannot start a thread", &error);
     let RecorderConnections { control, ingress, starter: starter_socket, signer } = connections;
@@ -73,23 +112,14 @@ pub fn run(
     if options.clips_max.is_some() || options.bytes_max.is_some() {
         deleted = folder.keep_at_most(options.clips_max, options.bytes_max)?;
     }
-    let settings = Settings {
-        store: Store::Ram,
-        preroll_bytes: options.preroll_bytes.unwrap_or(1 << 20),
-        max_length: Duration::from_secs(1),
-        folder: options.out.clone(),
-        clock: options.clock.to_string(),
-        prefault: true,
-    };
-    let mut recorder = Recorder::live(folder, settings)?;
-    recorder.advance(options.clock.now())?;
+    let recorder = live_recorder(folder, &options)?;
     let feed = Feed::connect(ingress).map_err(|error| {
         Failure::caused_by(Exit::Unreachable, "cannot join the ingress", &error)
     })?;
     // Of the first ingress, for the whole time: the threads of this process ring it, and a later
     // ingress has nothing to ring for that could not wait for `IDLE_WAIT`.
     let bell = feed.bell();
-    let feed = LastingFeed::new(feed, starter_socket);
+    let feed = ReconnectingReader::new(feed, starter_socket);
     let (events, inbox) = sync_channel(EVENTS);
     let (searches, requests) = channel();
     let background = Background {
@@ -99,10 +129,7 @@ pub fn run(
         bell: bell.clone(),
         out: options.out.clone(),
     };
-    let background = Builder::new()
-        .name("background".to_owned())
-        .spawn(move || background.run())
-        .map_err(internal)?;
+    let background = background.start().map_err(internal)?;
     starter(control, events, bell.clone()).map_err(internal)?;
     reports.send(RecorderReport::Ready);
     let (gone, stuck) = counted(&deleted);
@@ -117,11 +144,7 @@ pub fn run(
         commands: options.commands.map(Commands::new),
         roster: Roster::new(options.preroll_bytes),
         health: SystemHealth::default(),
-        deleted: RecordingCounts {
-            deleted: gone,
-            not_deleted: stuck,
-            ..RecordingCounts::default()
-        },
+        deleted: RecordingCounts { deleted: gone, not_deleted: stuck, ..Default::default() },
         disk_floor: options.disk_floor,
         dead: None,
         is_ending: false,
@@ -129,24 +152,14 @@ pub fn run(
         reporter: Reporter::new(reports),
     };
     deleted.into_iter().for_each(|loss| recorder_loop.reporter.send(RecorderReport::Loss(loss)));
-    let ended = recorder_loop.run();
-    let counts = recorder_loop.recorder.counts();
-    let last = RecorderStatus {
-        trigger_to_open: recorder_loop.roster.spreads().all(),
-        ..recorder_loop.status(&counts)
-    };
-    // A thread that waits for room in the inbox would never end.
-    drop((recorder_loop.topics, recorder_loop.inbox));
-    recorder_loop.reporter.end(RecorderReport::Ended(Box::new(last)));
-    let _ = background.join();
-    ended
+    Ok((recorder_loop, background))
 }
 
 struct RecorderLoop {
     recorder: Recorder,
     clock: Clock,
     /// Threads of this process ring it after each event.
-    bell: FeedBell,
+    bell: Waker,
     inbox: Receiver<LoopEvent>,
     topics: Topics,
     /// The time of the last look at messages of the ingress.

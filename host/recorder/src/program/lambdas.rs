@@ -4,11 +4,11 @@ use std::sync::mpsc::{Receiver, TryRecvError};
 use std::time::Instant;
 
 use gleaner_base::RateLimit;
-use gleaner_journal::JournalEntry;
+use gleaner_journal::{JournalEntry, JournalHeader};
 use gleaner_lambda::manifest::RecordSpec;
 use gleaner_protocol::RecordingCounts;
 use gleaner_protocol::link::LambdaReplies;
-use gleaner_vitals::IntervalDurations;
+use gleaner_protocol::process_stats::IntervalDurations;
 use tracing::warn;
 
 use super::connections::LambdaEvent;
@@ -96,38 +96,19 @@ impl ConnectedLambda {
         let mut polled = PollResult::default();
         for _ in 0..MESSAGES_PER_TURN {
             let event = match self.inbox.try_recv() {
-                Ok(event) => event,
                 Err(TryRecvError::Empty) => break,
-                Err(TryRecvError::Disconnected) => LambdaEvent::Closed(None),
+                event => event.unwrap_or(LambdaEvent::Closed(None)),
             };
             polled.is_busy = true;
             match event {
-                LambdaEvent::Hello(header) => {
-                    let digest = lambda_digest(&header.files);
-                    let (rules, topics) = (self.rules.clone(), self.topics.clone());
-                    match recorder.try_add_lambda(LambdaSpec {
-                        header: *header,
-                        rules,
-                        digest,
-                        topics,
-                    }) {
-                        Ok(id) => {
-                            self.id = Some(id);
-                            polled.is_new = Some(id);
-                            self.replies.ready();
-                        }
-                        Err(why) => {
-                            let error = &why as &dyn std::error::Error;
-                            warn!(lambda = %self.name, error, "cannot record for a lambda");
-                            self.replies.refused(&why.to_string());
-                            (polled.is_refused, polled.is_gone) = (true, true);
-                        }
-                    }
-                }
+                LambdaEvent::Hello(header) => match self.hello(*header, recorder) {
+                    Some(id) => polled.is_new = Some(id),
+                    None => polled.is_refused = true,
+                },
                 LambdaEvent::Mismatch(why) => {
-                    warn!(lambda = %self.name, %why, "a lambda differs from its announcement");
+                    warn!(lambda = %self.name, %why, "a lambda is not the one that was announced");
                     self.replies.refused(&why);
-                    (polled.is_refused, polled.is_gone) = (true, true);
+                    polled.is_refused = true;
                 }
                 LambdaEvent::Wake { entry, decided_ns, missing, encoded } => {
                     let Some(id) = self.id else { continue };
@@ -135,22 +116,17 @@ impl ConnectedLambda {
                         recorder.lost_wakes(id, entry.at_ns, missing.into());
                         polled.counted.wakes_lost += u64::from(missing);
                     }
-                    if let Some(refused) = self.refused(&entry, encoded.len(), now_ns) {
-                        recorder.lost_wakes(id, entry.at_ns.clamp(0, now_ns.max(0)), 1);
-                        polled.counted.add(&refused);
-                        continue;
-                    }
-                    recorder.encoded_wake(id, &entry, &encoded)?;
-                    if !entry.triggers.is_empty() {
+                    let refused = self.wake(id, &entry, &encoded, now_ns, recorder)?;
+                    polled.counted.add(&refused.unwrap_or_default());
+                    if refused.is_none() && !entry.triggers.is_empty() {
                         let wait_ns = monotonic_ns().saturating_sub(decided_ns);
                         spreads.add(wait_ns);
                         self.replies.opened(u64::try_from(wait_ns).unwrap_or(0));
                     }
                 }
                 LambdaEvent::Engine(engine) => {
-                    if let Some(id) = self.id {
-                        recorder.set_engine(id, engine);
-                    }
+                    let Some(id) = self.id else { continue };
+                    recorder.set_engine(id, engine);
                 }
                 LambdaEvent::Closed(why) => {
                     if let Some(why) = why {
@@ -160,6 +136,7 @@ impl ConnectedLambda {
                     polled.is_gone = true;
                 }
             }
+            polled.is_gone |= polled.is_refused;
             if polled.is_gone {
                 self.replies.close();
                 if let Some(id) = self.id {
@@ -169,6 +146,42 @@ impl ConnectedLambda {
             }
         }
         Ok(polled)
+    }
+
+    /// Adds the lambda to the recorder; `None` if it is refused.
+    fn hello(&mut self, header: JournalHeader, recorder: &mut Recorder) -> Option<LambdaId> {
+        let digest = lambda_digest(&header.files);
+        let (rules, topics) = (self.rules.clone(), self.topics.clone());
+        match recorder.try_add_lambda(LambdaSpec { header, rules, digest, topics }) {
+            Ok(id) => {
+                self.id = Some(id);
+                self.replies.ready();
+            }
+            Err(why) => {
+                let error = &why as &dyn std::error::Error;
+                warn!(lambda = %self.name, error, "cannot record for a lambda");
+                self.replies.refused(&why.to_string());
+                return None;
+            }
+        }
+        self.id
+    }
+
+    /// Records a wake; returns its counts if it is refused.
+    fn wake(
+        &mut self,
+        id: LambdaId,
+        entry: &JournalEntry,
+        encoded: &[u8],
+        now_ns: i64,
+        recorder: &mut Recorder,
+    ) -> Result<Option<RecordingCounts>, RecordError> {
+        let refused = self.refused(entry, encoded.len(), now_ns);
+        match refused {
+            Some(_) => recorder.lost_wakes(id, entry.at_ns.clamp(0, now_ns.max(0)), 1),
+            None => recorder.encoded_wake(id, entry, encoded)?,
+        }
+        Ok(refused)
     }
 
     /// Checks a wake against the rate limits and the clock; returns its counts if it is refused. A
@@ -200,12 +213,12 @@ impl ConnectedLambda {
             true => RecordingCounts {
                 wakes_over_rate: 1,
                 triggers_over_rate: triggers,
-                ..RecordingCounts::default()
+                ..Default::default()
             },
             false => RecordingCounts {
                 wakes_misstamped: 1,
                 triggers_misstamped: triggers,
-                ..RecordingCounts::default()
+                ..Default::default()
             },
         })
     }

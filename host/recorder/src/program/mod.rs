@@ -25,6 +25,8 @@ mod report_writer;
 mod roster;
 mod samples;
 mod status;
+#[cfg(test)]
+mod tests;
 mod topics;
 
 use std::fs::File;
@@ -36,14 +38,14 @@ use std::sync::Arc;
 
 use clap::Parser;
 use gleaner_base::{Exit, Failure, safe_file};
-use gleaner_jail::recorder as sandbox;
 use gleaner_messages::Sources;
+use gleaner_messages::transport::Clock;
 use gleaner_protocol::Handover;
 use gleaner_protocol::link::LinkError;
-use gleaner_transport::Clock;
+use gleaner_protocol::process_stats::log;
+use gleaner_protocol::process_stats::start::{reports, stop_flag};
+use gleaner_sandbox::recorder as sandbox;
 use gleaner_trust::{ClipSigner, SecretKey, VehicleName};
-use gleaner_vitals::log;
-use gleaner_vitals::start::{reports, stop_flag};
 use rustix::process::{Signal, set_parent_process_death_signal};
 
 use crate::RecordError;
@@ -102,19 +104,19 @@ fn start(args: Args) -> Result<(), Failure> {
     // A starter that dies also closes our standard input. In either case, open clips are completed.
     set_parent_process_death_signal(Some(Signal::TERM))
         .map_err(io::Error::from)
-        .map_err(internal("cannot watch for the starter's death"))?;
+        .map_err(internal("cannot watch for the parent process's death"))?;
     let stop = stop_flag().map_err(internal("cannot handle SIGTERM"))?;
     // Ctrl-C in a terminal reaches all processes; the starter decides when this one ends.
     signal_hook::flag::register(signal_hook::consts::SIGINT, Arc::default())
         .map_err(internal("cannot handle SIGINT"))?;
     let unusable = |error: LinkError| {
-        Failure::caused_by(Exit::Usage, "cannot use the connections of the starter", &error)
+        Failure::caused_by(Exit::Usage, "cannot use the connections of the parent process", &error)
             .with_help("start it with `gleaner run LAMBDA`")
     };
     let mut handover = Handover::receive(rustix::stdio::stdin()).map_err(unusable)?;
     let starter = rustix::io::fcntl_dupfd_cloexec(rustix::stdio::stdin(), 3)
         .map_err(io::Error::from)
-        .map_err(internal("cannot take the socket of the starter"))?;
+        .map_err(internal("cannot take the socket of the parent process"))?;
     let control = handover.take_control().map_err(unusable)?;
     let ingress = handover.take_ingress().map_err(unusable)?;
     let signer = signer(args.vehicle_name.clone(), handover.key.take())?;

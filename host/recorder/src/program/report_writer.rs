@@ -60,7 +60,7 @@ impl ReportWriter {
             Err(TrySendError::Full(_)) => {
                 self.dropped += 1;
                 if self.dropped == 1 {
-                    warn!("the starter does not read reports: some are dropped");
+                    warn!("the parent process does not read reports: some are dropped");
                 }
             }
         }
@@ -73,7 +73,7 @@ impl ReportWriter {
         drop((reports, losses));
         let _ = ended.recv_timeout(END_TIMEOUT);
         if dropped > 0 {
-            warn!(dropped, "reports dropped: the starter did not read them");
+            warn!(dropped, "reports dropped: the parent process did not read them");
         }
     }
 }
@@ -105,7 +105,7 @@ mod tests {
 
     use super::*;
     use crate::RecordingFolder;
-    use crate::support::TestDir;
+    use crate::recorder::tests::support::TestDir;
 
     #[test]
     fn a_loss_is_noted_even_if_the_starter_reads_nothing() {

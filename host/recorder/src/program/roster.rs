@@ -4,9 +4,9 @@ use std::collections::BTreeMap;
 
 use gleaner_base::Failure;
 use gleaner_lambda::manifest::{RecordSpec, Store};
+use gleaner_messages::transport::Clock;
 use gleaner_protocol::RecordingCounts;
-use gleaner_transport::Clock;
-use gleaner_vitals::IntervalDurations;
+use gleaner_protocol::process_stats::IntervalDurations;
 use tracing::warn;
 
 use super::commands::Commands;
@@ -84,7 +84,7 @@ impl Roster {
                 let remapped = remaps.iter().find(|(from, _)| from == wanted.as_str());
                 let topic = remapped.map_or(wanted.as_str(), |(_, to)| to.as_str());
                 let Some((_, grant)) = grants.iter().find(|(granted, _)| granted == topic) else {
-                    return Some(format!("the starter did not grant topic `{topic}`"));
+                    return Some(format!("the parent process did not grant topic `{topic}`"));
                 };
                 match recorder.add_missing_topic(topic) {
                     Ok(id) => {

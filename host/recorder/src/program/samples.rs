@@ -3,17 +3,17 @@
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-use gleaner_feed::FedTopic;
-use gleaner_transport::{SampleMeta, StoredMeta, TopicCounters};
+use gleaner_messages::transport::{SampleMeta, StoredMeta, TopicCounters};
+use gleaner_samples::SharedTopicReader;
 
 /// Attempts to find a sample that stays until it is looked at: the ingress publishes meanwhile.
 const ATTEMPTS: u32 = 8;
 
 /// The samples of one topic, read in order, over restarts of the ingress.
-pub struct FedSamples {
-    fed: FedTopic,
+pub struct SampleReader {
+    fed: SharedTopicReader,
     /// Later memory of the topic: each begins where nothing is written to the one before it.
-    later: VecDeque<FedTopic>,
+    later: VecDeque<SharedTopicReader>,
     /// Samples that were too large for earlier memory.
     too_big_before: u64,
     /// Position of the next sample.
@@ -24,16 +24,16 @@ pub struct FedSamples {
     missed: u64,
 }
 
-impl FedSamples {
-    pub fn new(fed: FedTopic) -> FedSamples {
+impl SampleReader {
+    pub fn new(fed: SharedTopicReader) -> SampleReader {
         let next = fed.info.first;
         let (later, too_big_before) = (VecDeque::new(), 0);
-        FedSamples { fed, later, too_big_before, next, ahead: None, received: 0, missed: 0 }
+        SampleReader { fed, later, too_big_before, next, ahead: None, received: 0, missed: 0 }
     }
 
     /// Continues in the memory of an ingress that was started again, after the samples that the
     /// earlier one has left.
-    pub fn continue_in(&mut self, fed: FedTopic) {
+    pub fn continue_in(&mut self, fed: SharedTopicReader) {
         self.later.push_back(fed);
     }
 

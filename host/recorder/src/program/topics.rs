@@ -7,16 +7,16 @@ use std::sync::mpsc::Sender;
 use std::time::{Duration, Instant};
 
 use gleaner_base::visible;
-use gleaner_feed::{FedTopic, FeedError, FeedEvent, LastingFeed};
+use gleaner_messages::transport::{SampleMeta, same_type};
 use gleaner_messages::type_description::type_hash;
 use gleaner_protocol::ReceptionGaps;
-use gleaner_protocol::ingress::{ReceptionStatus, RefusedTopic, SourceStatus};
-use gleaner_protocol::link::{COMMANDS_ID, RecordedTopic};
-use gleaner_transport::{SampleMeta, same_type};
+use gleaner_protocol::ingress::{COMMANDS_ID, ReceptionStatus, RefusedTopic, SourceStatus};
+use gleaner_protocol::link::RecordedTopic;
+use gleaner_samples::{FeedError, FeedEvent, ReconnectingReader, SharedTopicReader};
 use tracing::{error, warn};
 
 use super::background::DefinitionsRequest;
-use super::samples::FedSamples;
+use super::samples::SampleReader;
 use crate::{RecordError, Recorder, TopicId, TopicSchema};
 
 /// Time that a topic may wait for its definitions; the ingress asks the nodes that write it.
@@ -47,7 +47,7 @@ enum Supply {
 }
 
 struct FedRecording {
-    samples: FedSamples,
+    samples: SampleReader,
     description: Description,
     /// The time when it was attached.
     since_ns: i64,
@@ -71,16 +71,16 @@ struct GrantedTopic {
 }
 
 pub struct Topics {
-    feed: LastingFeed,
+    feed: ReconnectingReader,
     /// To the thread that searches definitions.
     searches: Sender<DefinitionsRequest>,
     topics: Vec<GrantedTopic>,
     /// Events of topics that no lambda has announced yet, in their order.
-    early: BTreeMap<u32, Vec<Result<FedTopic, RefusedTopic>>>,
+    early: BTreeMap<u32, Vec<Result<SharedTopicReader, RefusedTopic>>>,
 }
 
 impl Topics {
-    pub fn new(feed: LastingFeed, searches: Sender<DefinitionsRequest>) -> Topics {
+    pub fn new(feed: ReconnectingReader, searches: Sender<DefinitionsRequest>) -> Topics {
         Topics { feed, searches, topics: Vec::new(), early: BTreeMap::new() }
     }
 
@@ -114,7 +114,7 @@ impl Topics {
     }
 
     /// Handles messages of the ingress; returns the topic of commands once it is attached.
-    pub fn poll(&mut self, now_ns: i64) -> Result<Option<FedTopic>, FeedError> {
+    pub fn poll(&mut self, now_ns: i64) -> Result<Option<SharedTopicReader>, FeedError> {
         let mut commands = None;
         for event in self.feed.poll()? {
             match event {
@@ -203,7 +203,7 @@ impl Topics {
         self.feed.reception(id)
     }
 
-    fn attach(&mut self, fed: FedTopic, since_ns: i64) {
+    fn attach(&mut self, fed: SharedTopicReader, since_ns: i64) {
         let id = fed.info.id;
         let Some(known) = self.topics.iter_mut().find(|known| known.id == id) else {
             self.early.entry(id).or_default().push(Ok(fed));
@@ -225,7 +225,7 @@ impl Topics {
         // It ends only with the loop.
         let _ = self.searches.send(DefinitionsRequest { id, type_name });
         known.supply = Supply::Fed(Box::new(FedRecording {
-            samples: FedSamples::new(fed),
+            samples: SampleReader::new(fed),
             description: Description::Searched,
             since_ns,
             is_warned: false,
@@ -238,13 +238,13 @@ impl Topics {
     fn refuse(&mut self, id: u32, reason: RefusedTopic) {
         let Some(known) = self.topics.iter_mut().find(|known| known.id == id) else {
             if id == COMMANDS_ID {
-                error!(why = in_words(&reason), "cannot receive the topic of commands");
+                error!(why = describe(&reason), "cannot receive the topic of commands");
             } else {
                 self.early.entry(id).or_default().push(Err(reason));
             }
             return;
         };
-        let why = in_words(&reason);
+        let why = describe(&reason);
         error!(topic = %visible(&known.name), %why, "cannot record a topic");
         known.refused = Some(why);
     }
@@ -263,16 +263,7 @@ impl Topics {
         else {
             return;
         };
-        // That of an ingress that was started again may be another one.
-        if fed.samples.lacks_layout() {
-            match fed.layout_asked {
-                None if self.feed.request_layout(*id).is_ok() => {
-                    fed.layout_asked = Some(Instant::now());
-                }
-                Some(at) if at.elapsed() >= DEFINITIONS_TIMEOUT => fed.samples.set_layout(None),
-                _ => {}
-            }
-        }
+        fed.request_layout(*id, &mut self.feed);
         match &fed.description {
             Description::Settled | Description::Searched => return,
             _ if fed.samples.look().is_none() || fed.samples.lacks_layout() => return,
@@ -304,7 +295,7 @@ impl Topics {
             warn!(
                 %topic,
                 %type_name,
-                "no definitions of this type; recording its messages without"
+                "no definitions of this type; recording its messages without a schema"
             );
         }
         let schema = TopicSchema {
@@ -334,9 +325,22 @@ impl Topics {
         let stamp = fed.samples.look().filter(|_| !fed.samples.lacks_layout());
         if fed.samples.missed() > 0 && !std::mem::replace(&mut fed.is_warned, true) {
             let (topic, missed) = (visible(name), fed.samples.missed());
-            warn!(%topic, missed, "samples left before the recorder took them");
+            warn!(%topic, missed, "recorder too slow: samples overwritten");
         }
         stamp
+    }
+}
+
+impl FedRecording {
+    /// Requests the layout if it is unknown: that of an ingress that was started again may be
+    /// another one.
+    fn request_layout(&mut self, id: u32, feed: &mut ReconnectingReader) {
+        match self.layout_asked {
+            _ if !self.samples.lacks_layout() => {}
+            None if feed.request_layout(id).is_ok() => self.layout_asked = Some(Instant::now()),
+            Some(at) if at.elapsed() >= DEFINITIONS_TIMEOUT => self.samples.set_layout(None),
+            _ => {}
+        }
     }
 }
 
@@ -354,10 +358,10 @@ impl GrantedTopic {
             topic: self.name.clone(),
             type_name: samples.map(|samples| samples.type_name().to_owned()),
             writers: status.writers,
-            received: samples.map_or(0, FedSamples::received),
+            received: samples.map_or(0, SampleReader::received),
             lost: status.lost,
-            no_slot: samples.map_or(0, FedSamples::missed),
-            too_big: samples.map_or(0, FedSamples::too_big),
+            no_slot: samples.map_or(0, SampleReader::missed),
+            too_big: samples.map_or(0, SampleReader::too_big),
             malformed: status.malformed,
             qos: status.qos,
             qos_warnings: status.qos_warnings,
@@ -365,7 +369,7 @@ impl GrantedTopic {
     }
 }
 
-fn in_words(reason: &RefusedTopic) -> String {
+fn describe(reason: &RefusedTopic) -> String {
     match reason {
         RefusedTopic::NoSuchTopic { .. } => "there is no such topic".to_owned(),
         RefusedTopic::WrongType { found } => format!("its type is `{}`", visible(found)),
@@ -377,14 +381,13 @@ fn in_words(reason: &RefusedTopic) -> String {
 mod tests {
     use std::sync::mpsc::channel;
 
-    use gleaner_feed::Feed;
     use gleaner_ingress::Ingress;
-    use gleaner_protocol::ingress::{AddReader, IngressControl, Qos};
-    use gleaner_protocol::link::recorded_grant;
-    use gleaner_transport::loopback::Loopback;
+    use gleaner_messages::transport::loopback::Loopback;
+    use gleaner_protocol::ingress::{AddReader, IngressControl, Qos, recorded_grant};
+    use gleaner_samples::Feed;
 
     use super::*;
-    use crate::support::{TestDir, meta};
+    use crate::recorder::tests::support::{TestDir, meta};
 
     const TYPE: &str = "test_msgs/msg/Number";
     const TIMEOUT: Duration = Duration::from_secs(60);
@@ -409,7 +412,7 @@ mod tests {
         let mut recorder = scratch.recorder(|_| {});
         let (source, _control, feed) = fed(&["/a", "/b"], 100);
         let (searches, searched) = channel();
-        let mut topics = Topics::new(LastingFeed::new(feed, None), searches);
+        let mut topics = Topics::new(ReconnectingReader::new(feed, None), searches);
         for (name, id) in [("/a", 1), ("/b", 2)] {
             let topic = recorder.add_missing_topic(name).unwrap();
             topics.add(id, name, topic, 0);
@@ -447,13 +450,13 @@ mod tests {
     #[test]
     fn samples_that_leave_before_they_are_read_are_counted() {
         let (source, _control, mut feed) = fed(&["/a"], 16 << 20);
-        let mut samples = FedSamples::new(feed.topic(1, TIMEOUT).unwrap());
+        let mut samples = SampleReader::new(feed.topic(1, TIMEOUT).unwrap());
         for seq in 1..=100 {
             source.publish("/a", &meta(seq as i64, seq), &[7; 8]).unwrap();
         }
         let mut read = Vec::new();
         while samples.look().is_some() {
-            let keep = |meta: &gleaner_transport::SampleMeta, _: &[u8]| {
+            let keep = |meta: &gleaner_messages::transport::SampleMeta, _: &[u8]| {
                 read.push(meta.seq);
                 Ok::<(), RecordError>(())
             };

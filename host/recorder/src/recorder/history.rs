@@ -2,7 +2,9 @@
 
 use std::collections::VecDeque;
 
-use gleaner_transport::{Gaps, Guid, LatchRule, LatchedSample, LatchedTopics, SampleMeta};
+use gleaner_messages::transport::{
+    Gaps, Guid, LatchRule, LatchedSample, LatchedTopics, SampleMeta,
+};
 
 use super::clips::OpenClip;
 use super::sources::RecordedSources;
@@ -18,7 +20,7 @@ const WRITERS: usize = 256;
 
 /// The preroll, with the losses of each source. Time never goes back.
 pub struct History {
-    preroll: Preroll,
+    pub preroll: Preroll,
     /// The longest message that any clip can hold.
     message_bytes: usize,
     /// By topic.
@@ -64,14 +66,6 @@ impl History {
             outages: VecDeque::new(),
             noticed_at: i64::MIN,
         }
-    }
-
-    pub fn preroll(&self) -> &Preroll {
-        &self.preroll
-    }
-
-    pub fn preroll_mut(&mut self) -> &mut Preroll {
-        &mut self.preroll
     }
 
     pub fn now(&self) -> Option<i64> {

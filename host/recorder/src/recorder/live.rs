@@ -40,7 +40,7 @@ impl Recorder {
         let unsigned = folder.unsigned();
         let disk = ClipDisk::background(folder)?;
         let mut recorder = Recorder::with(disk, settings, unsigned, true)?;
-        recorder.clips.set_grace(nanoseconds(GRACE));
+        recorder.clips.windows.set_grace(nanoseconds(GRACE));
         Ok(recorder)
     }
 
@@ -53,34 +53,34 @@ impl Recorder {
     /// [`RecordError`] if the preroll is on disk and that fails, or if the writer thread has ended.
     /// A clip that could not be written is no such error: see [`Recorder::take_failures`].
     pub fn work(&mut self) -> Result<Work, RecordError> {
-        self.clips.progress_mut().poll()?;
+        self.clips.progress.poll()?;
         self.clips.run_within(Budget::STEP, &mut self.material)?;
-        if self.clips.progress().is_settled() {
+        if self.clips.progress.is_settled() {
             return Ok(Work::Done);
         }
-        Ok(if self.clips.progress().has_room() { Work::More } else { Work::Wait })
+        Ok(if self.clips.progress.has_room() { Work::More } else { Work::Wait })
     }
 
     /// Takes the errors of clips that could not be written since the last call; the first 16.
     pub fn take_failures(&mut self) -> Vec<RecordError> {
-        self.clips.progress_mut().finished_mut().take_failures()
+        self.clips.progress.finished.take_failures()
     }
 
     /// Takes the clips of an earlier process that were recovered since the last call. One that
     /// cannot be recovered is among the failures.
     pub fn take_recovered(&mut self) -> Vec<Clip> {
-        self.clips.progress_mut().finished_mut().take_recovered()
+        self.clips.progress.finished.take_recovered()
     }
 
     /// Takes the clips that were deleted to make room, or could not be deleted, since the last
     /// call; the first of them.
     pub fn take_deleted(&mut self) -> Vec<Loss> {
-        self.clips.progress_mut().finished_mut().take_deleted()
+        self.clips.progress.finished.take_deleted()
     }
 
     /// Returns whether a clip is open.
     pub fn is_recording(&self) -> bool {
-        self.clips.progress().is_open()
+        self.clips.progress.is_open()
     }
 
     /// Adds the description of a topic that was missing; its samples arrive since `since_ns`.
@@ -94,14 +94,14 @@ impl Recorder {
         topic: TopicSchema,
         since_ns: i64,
     ) -> Result<(), RecordError> {
-        self.material.sources.found_topic(id.index(), topic, since_ns)
+        self.material.sources.found_topic(id.0, topic, since_ns)
     }
 
     /// Counts wakes of a lambda that did not arrive; `at_ns` is the stamp of the next one that
     /// does.
     pub fn lost_wakes(&mut self, lambda: LambdaId, at_ns: i64, count: u64) {
-        self.material.sources.count_wakes(lambda.index(), count);
-        self.material.history.lost_wakes(lambda.index(), at_ns, count);
+        self.material.sources.count_wakes(lambda.0, count);
+        self.material.history.lost_wakes(lambda.0, at_ns, count);
     }
 
     /// Notes that the ingress has ended at `at_ns` or later, or that another one was joined then.
@@ -114,10 +114,6 @@ impl Recorder {
     /// Executes a command in the name of `lambda`; `source` describes who gave it. It is not a
     /// wake: it is in no journal, and has no effect on the lambda's cooldown. A stop ends only a
     /// recording that a command started with this label.
-    ///
-    /// # Errors
-    ///
-    /// [`RecordError`] if the disk fails.
     pub fn command(
         &mut self,
         lambda: LambdaId,
@@ -130,7 +126,7 @@ impl Recorder {
             return Ok(Commanded::DiskSuppressed);
         }
         let (kind, label) = (trigger.kind, &trigger.label);
-        let commanded = match self.clips.command(lambda.index(), kind, label, at_ns) {
+        let commanded = match self.clips.windows.command(lambda.0, kind, label, at_ns) {
             TriggerOutcome::Opened => {
                 self.counts.recording.windows += 1;
                 Commanded::Opened
@@ -143,35 +139,27 @@ impl Recorder {
                 return Ok(Commanded::Ignored);
             }
         };
-        let name = self.material.sources.name(lambda.index());
+        let name = self.material.sources.name(lambda.0);
         let moment = Moment { source: Some(source), ..Moment::of(name, trigger, at_ns) };
-        self.clips.await_clip(lambda.index(), moment);
+        self.clips.await_clip(lambda.0, moment);
         self.clips.act(&mut self.material)?;
         Ok(commanded)
     }
 
     /// Replaces the engine of a lambda. Clips that end later state it.
     pub fn set_engine(&mut self, lambda: LambdaId, engine: String) {
-        self.material.sources.set_engine(lambda.index(), engine);
+        self.material.sources.set_engine(lambda.0, engine);
     }
 
     /// Ends a lambda, and the recordings that it started and did not stop.
-    ///
-    /// # Errors
-    ///
-    /// [`RecordError`] if the disk fails.
     pub fn end_lambda(&mut self, lambda: LambdaId, at_ns: i64) -> Result<(), RecordError> {
-        self.clips.end_lambda(lambda.index(), at_ns, &mut self.material)
+        self.clips.end_lambda(lambda.0, at_ns, &mut self.material)
     }
 
     /// Suspends recording: no clip is begun, and the open one ends with the reason `why`. A preroll
     /// on disk shrinks. `None` resumes.
-    ///
-    /// # Errors
-    ///
-    /// [`RecordError`] if the disk fails.
     pub fn hold(&mut self, why: Option<&str>) -> Result<(), RecordError> {
-        self.material.history.preroll_mut().shrink(why.is_some());
+        self.material.history.preroll.shrink(why.is_some());
         // The open clip ends at once.
         self.clips.hold(why, if why.is_some() { 0 } else { nanoseconds(GRACE) });
         self.clips.run(&mut self.material)
@@ -195,8 +183,8 @@ impl Recorder {
         }
         let bytes = bytes.max(self.counts.preroll_bound);
         let folder = folder.join("preroll");
-        if self.material.history.preroll_mut().grow(store, bytes, folder, *prefault)? {
-            self.clips.progress_mut().preroll_moved();
+        if self.material.history.preroll.grow(store, bytes, folder, *prefault)? {
+            self.clips.progress.preroll_moved();
         }
         self.counts.preroll_bound = bytes;
         Ok(())

@@ -13,7 +13,7 @@ mod live;
 mod settings;
 mod sources;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 mod writer;
 
 use std::sync::Arc;
@@ -22,8 +22,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use gleaner_base::nanoseconds;
 use gleaner_journal::JournalEntry;
 use gleaner_lambda::{Clip, Moment, TriggerKind};
+use gleaner_messages::transport::{LatchedSample, SampleMeta};
 use gleaner_protocol::RecordingCounts;
-use gleaner_transport::{LatchedSample, SampleMeta};
 
 use crate::RecordError;
 use crate::file::{RecordingFolder, TopicSchema};
@@ -39,7 +39,7 @@ pub(crate) use live::counted;
 pub use settings::{Commanded, LambdaId, RecorderCounts, Settings, TopicId, Work};
 pub use sources::{LambdaSpec, TOPICS_MAX};
 
-struct Material {
+struct RecorderContext {
     sources: RecordedSources,
     history: History,
 }
@@ -51,10 +51,11 @@ struct Material {
 /// stamps only. A recorder of [`live`](Self::live) leaves long work to a thread, and to
 /// [`work`](Self::work), which has to be called in between.
 ///
-/// After an error, drop the recorder. Its written data is recovered by the next
-/// [`RecordingFolder::open`].
+/// Calls that return [`RecordError`] fail if the disk of the preroll fails, or, in a replay, that
+/// of the clips. Live, a clip that could not be written is in [`Recorder::take_failures`]. After an
+/// error, drop the recorder. Its written data is recovered by the next [`RecordingFolder::open`].
 pub struct Recorder {
-    material: Material,
+    material: RecorderContext,
     clips: Clips,
     counts: RecorderCounts,
     encoded: Vec<u8>,
@@ -85,7 +86,7 @@ impl Recorder {
             Preroll::open(store, preroll_bytes, settings.folder.join("preroll"), prefault)?;
         let max_length_ns = nanoseconds(settings.max_length).max(1);
         Ok(Recorder {
-            material: Material {
+            material: RecorderContext {
                 sources: RecordedSources::new(settings.clock.clone(), is_live),
                 history: History::new(preroll, RecorderLimits::default().message_bytes),
             },
@@ -126,12 +127,12 @@ impl Recorder {
     ) -> Result<TopicId, RecordError> {
         let topic = self.material.sources.add_topic(topic, is_missing)?;
         self.material.history.grow(topic + 1, 0);
-        Ok(TopicId::new(topic))
+        Ok(TopicId(topic))
     }
 
     /// Adds a sentence on what all clips lack.
     pub fn note(&mut self, note: String) {
-        self.material.sources.add_note(note);
+        self.material.sources.notes.push(note);
     }
 
     /// Adds a lambda that records, before its first wake.
@@ -151,28 +152,24 @@ impl Recorder {
     /// [`RecordError::TooManyLambdas`] beyond 1024.
     pub fn try_add_lambda(&mut self, member: LambdaSpec) -> Result<LambdaId, RecordError> {
         self.material.sources.check_room()?;
-        let lambda = self.clips.add_lambda(WindowRules {
+        let lambda = self.clips.windows.add(WindowRules {
             preroll_ns: nanoseconds(member.rules.preroll),
             postroll_ns: nanoseconds(member.rules.postroll),
             cooldown_ns: nanoseconds(member.rules.cooldown),
         });
         self.material.sources.add_lambda(lambda, member);
         self.material.history.grow(0, lambda + 1);
-        Ok(LambdaId::new(lambda))
+        Ok(LambdaId(lambda))
     }
 
     /// Takes a sample.
-    ///
-    /// # Errors
-    ///
-    /// [`RecordError`] if the disk fails.
     pub fn sample(
         &mut self,
         topic: TopicId,
         meta: &SampleMeta,
         cdr: &[u8],
     ) -> Result<(), RecordError> {
-        let topic = topic.index();
+        let topic = topic.0;
         if meta.at_ns < 0 {
             self.counts.recording.before_1970 += 1;
             return Ok(());
@@ -183,7 +180,7 @@ impl Recorder {
         }
         let is_late = self.material.history.now().is_some_and(|now| meta.at_ns < now);
         self.counts.out_of_order += u64::from(is_late);
-        if self.clips.progress().is_live() {
+        if self.clips.progress.is_live {
             self.material.history.note_gap(topic, meta);
         }
         self.pass(meta.at_ns)?;
@@ -193,7 +190,7 @@ impl Recorder {
         let meta = SampleMeta { publish_ns: meta.publish_ns.max(0), is_latched: false, ..*meta };
         let in_group = self.clips.write(topic, &meta, cdr, &self.material)?;
         if let Some(rule) = self.material.sources.latch_rule(topic) {
-            let horizon = self.clips.horizon();
+            let horizon = self.clips.windows.horizon();
             self.material.history.latch(topic, LatchedSample::new(&meta, cdr), rule, horizon);
         }
         self.material.history.keep(EntryMeta::sample(topic, &meta, in_group), cdr)
@@ -203,13 +200,9 @@ impl Recorder {
     ///
     /// Live, its stamp does not advance time: earlier samples may still be in transit, and the wake
     /// may be up to 200 ms late.
-    ///
-    /// # Errors
-    ///
-    /// [`RecordError`] if the disk fails.
     pub fn wake(&mut self, lambda: LambdaId, entry: &JournalEntry) -> Result<(), RecordError> {
         let mut encoded = std::mem::take(&mut self.encoded);
-        self.material.sources.encode(lambda.index(), entry, &mut encoded);
+        self.material.sources.encode(lambda.0, entry, &mut encoded);
         let taken = self.encoded_wake(lambda, entry, &encoded);
         self.encoded = encoded;
         taken
@@ -217,26 +210,22 @@ impl Recorder {
 
     /// As [`Recorder::wake`], for a wake that its lambda has encoded without reference to another
     /// one: preroll and clip keep these bytes. They decode to `entry`.
-    ///
-    /// # Errors
-    ///
-    /// As [`Recorder::wake`].
     pub fn encoded_wake(
         &mut self,
         lambda: LambdaId,
         entry: &JournalEntry,
         encoded: &[u8],
     ) -> Result<(), RecordError> {
-        let number = self.material.sources.count_wakes(lambda.index(), 1);
+        let number = self.material.sources.count_wakes(lambda.0, 1);
         if entry.at_ns < 0 {
             self.counts.recording.before_1970 += 1;
             return Ok(());
         }
-        if !self.clips.progress().is_live() {
+        if !self.clips.progress.is_live {
             self.pass(entry.at_ns)?;
         }
-        let in_group = self.clips.wake(lambda.index(), number, entry.at_ns, encoded);
-        let held = EntryMeta::wake(lambda.index(), number, entry.at_ns, in_group);
+        let in_group = self.clips.wake(lambda.0, number, entry.at_ns, encoded);
+        let held = EntryMeta::wake(lambda.0, number, entry.at_ns, in_group);
         self.material.history.keep(held, encoded)?;
         if entry.triggers.is_empty() {
             return Ok(());
@@ -248,7 +237,7 @@ impl Recorder {
         }
         for trigger in &entry.triggers {
             let (kind, label) = (trigger.kind, &trigger.label);
-            match self.clips.trigger(lambda.index(), kind, label, entry.at_ns) {
+            match self.clips.windows.trigger(lambda.0, kind, label, entry.at_ns) {
                 TriggerOutcome::Opened => self.counts.recording.windows += 1,
                 TriggerOutcome::InCooldown => self.counts.recording.in_cooldown += 1,
                 TriggerOutcome::Ignored => self.counts.recording.ignored += 1,
@@ -256,18 +245,13 @@ impl Recorder {
                 TriggerOutcome::TooManyWaiting => self.counts.recording.too_many_waiting += 1,
                 TriggerOutcome::Stopped => {}
             }
-            let moment =
-                Moment::of(self.material.sources.name(lambda.index()), trigger, entry.at_ns);
-            self.clips.await_clip(lambda.index(), moment);
+            let moment = Moment::of(self.material.sources.name(lambda.0), trigger, entry.at_ns);
+            self.clips.await_clip(lambda.0, moment);
         }
         self.clips.act(&mut self.material)
     }
 
     /// Advances time without samples.
-    ///
-    /// # Errors
-    ///
-    /// [`RecordError`] if the disk fails.
     pub fn advance(&mut self, now_ns: i64) -> Result<(), RecordError> {
         self.pass(now_ns.max(0))
     }
@@ -279,13 +263,9 @@ impl Recorder {
 
     /// Ends the recording: completes open clips. A clip whose window had not ended notes that.
     /// Live, this waits for the disk.
-    ///
-    /// # Errors
-    ///
-    /// [`RecordError`] if the disk fails.
     pub fn finish(&mut self, end_ns: i64) -> Result<(), RecordError> {
-        self.clips.progress().disk().end_recovery();
-        self.clips.set_grace(0);
+        self.clips.progress.disk.end_recovery();
+        self.clips.windows.set_grace(0);
         self.pass(end_ns.max(0))?;
         let end = self.material.history.now().unwrap_or(end_ns);
         self.clips.finish(end, &mut self.material)
@@ -293,11 +273,11 @@ impl Recorder {
 
     /// The newest finished clips, in order; `clips.jsonl` has all.
     pub fn clips(&self) -> &[Clip] {
-        self.clips.progress().finished().newest()
+        self.clips.progress.finished.newest()
     }
 
     pub fn counts(&self) -> RecorderCounts {
-        let preroll = self.material.history.preroll();
+        let preroll = &self.material.history.preroll;
         let (evicted_early, too_big) = self.material.history.counts();
         let disk_suppressed = self.clips.disk_suppressed();
         let unsigned = self.unsigned.load(Ordering::Relaxed);
@@ -308,12 +288,12 @@ impl Recorder {
             unsigned,
             ..self.counts.recording
         };
-        recording.add(self.clips.progress().finished().counts());
+        recording.add(self.clips.progress.finished.counts());
         RecorderCounts {
             recording,
             preroll_bytes: preroll.bytes_held(),
             preroll_highest: preroll.bytes_highest(),
-            in_flight: self.clips.progress().in_flight(),
+            in_flight: self.clips.progress.in_flight(),
             ..self.counts
         }
     }
@@ -321,6 +301,6 @@ impl Recorder {
     #[cfg(test)]
     fn set_limits(&mut self, limits: RecorderLimits) {
         self.material.history.set_message_bytes(limits.message_bytes);
-        self.clips.progress_mut().set_limits(limits);
+        self.clips.progress.set_limits(limits);
     }
 }

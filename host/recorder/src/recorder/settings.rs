@@ -22,30 +22,10 @@ pub struct Settings {
 }
 
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub struct TopicId(usize);
-
-impl TopicId {
-    pub(super) fn new(index: usize) -> TopicId {
-        TopicId(index)
-    }
-
-    pub(super) fn index(self) -> usize {
-        self.0
-    }
-}
+pub struct TopicId(pub(super) usize);
 
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub struct LambdaId(usize);
-
-impl LambdaId {
-    pub(super) fn new(index: usize) -> LambdaId {
-        LambdaId(index)
-    }
-
-    pub(super) fn index(self) -> usize {
-        self.0
-    }
-}
+pub struct LambdaId(pub(super) usize);
 
 #[derive(Copy, Clone, Debug, Default, PartialEq, Eq)]
 pub struct RecorderCounts {
@@ -64,9 +44,7 @@ pub struct RecorderCounts {
 
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum Commanded {
-    /// It opened a window.
     Opened,
-    /// It ended a window.
     Stopped,
     /// Ignored: the recording to start is running, or the one to stop is not, or too many are.
     Ignored,
@@ -76,7 +54,6 @@ pub enum Commanded {
 
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum Work {
-    /// Nothing.
     Done,
     /// Some, now.
     More,

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use gleaner_journal::{Encoder, JournalEntry, JournalHeader};
 use gleaner_lambda::ClipLambda;
 use gleaner_lambda::manifest::RecordSpec;
-use gleaner_transport::{LatchRule, latched_depth};
+use gleaner_messages::transport::{LatchRule, latched_depth};
 
 use super::settings::TopicId;
 use crate::file::TopicSchema;
@@ -61,31 +61,19 @@ struct SourceLambda {
 }
 
 pub struct RecordedSources {
-    clock: String,
+    pub clock: String,
     /// True if its samples have writers.
     is_live: bool,
     topics: Vec<SourceTopic>,
     lambdas: Vec<SourceLambda>,
     /// Sentences about all clips.
-    notes: Vec<String>,
+    pub notes: Vec<String>,
 }
 
 impl RecordedSources {
     pub fn new(clock: String, is_live: bool) -> RecordedSources {
         let (topics, lambdas, notes) = (Vec::new(), Vec::new(), Vec::new());
         RecordedSources { clock, is_live, topics, lambdas, notes }
-    }
-
-    pub fn clock(&self) -> &str {
-        &self.clock
-    }
-
-    pub fn add_note(&mut self, note: String) {
-        self.notes.push(note);
-    }
-
-    pub fn notes(&self) -> &[String] {
-        &self.notes
     }
 
     /// Adds a topic; an existing one of the same name is unchanged. Returns its number.
@@ -139,7 +127,7 @@ impl RecordedSources {
 
     pub fn add_lambda(&mut self, lambda: usize, spec: LambdaSpec) {
         let LambdaSpec { header, digest, topics, .. } = spec;
-        let topics: Vec<usize> = topics.iter().map(|topic| topic.index()).collect();
+        let topics: Vec<usize> = topics.iter().map(|topic| topic.0).collect();
         for topic in &topics {
             let lambdas = &mut self.topics[*topic].lambdas;
             if !lambdas.contains(&lambda) {

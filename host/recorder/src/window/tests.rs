@@ -3,7 +3,6 @@
 use gleaner_lambda::TriggerKind::{self, Event, Start, Stop};
 
 use super::*;
-use crate::support::{ModelWindow, SeededRandom, model_groups};
 
 fn rules(preroll_ns: i64, postroll_ns: i64, cooldown_ns: i64) -> WindowRules {
     WindowRules { preroll_ns, postroll_ns, cooldown_ns }
@@ -339,4 +338,66 @@ fn a_lambda_at_its_limit_does_not_block_commands() {
     let outcomes: Vec<_> =
         (0..=STARTED_MAX).map(|n| windows.command(0, Start, &n.to_string(), 100)).collect();
     assert_eq!(count_opened(&outcomes), STARTED_MAX);
+}
+
+/// A window of a model: lambda, first and last instant.
+pub type ModelWindow = (usize, i64, i64);
+
+/// Computes groups of windows by brute force: all windows at once, then the connected ones. It has
+/// no state, and ignores the order of arrival.
+///
+/// `rolls` are preroll, postroll and cooldown of each lambda. A trigger is a stamp, the lambda and
+/// the kind.
+pub fn model_groups(
+    rolls: &[(i64, i64, i64)],
+    triggers: &[(i64, usize, TriggerKind)],
+) -> Vec<Vec<ModelWindow>> {
+    use TriggerKind::{Event, Start, Stop};
+    let mut windows = Vec::new();
+    for (lambda, (preroll, postroll, cooldown)) in rolls.iter().enumerate() {
+        let (mut opened, mut started) = (None, None);
+        for (at, _, kind) in triggers.iter().filter(|(_, owner, _)| *owner == lambda) {
+            let cool = opened.is_none_or(|opened: i64| *at >= opened + cooldown);
+            match (kind, started) {
+                (Stop, Some(from)) => {
+                    windows.push((lambda, from, at + postroll));
+                    started = None;
+                }
+                (Event, _) if cool => {
+                    windows.push((lambda, at - preroll, at + postroll));
+                    opened = Some(*at);
+                }
+                (Start, None) if cool => {
+                    started = Some(at - preroll);
+                    opened = Some(*at);
+                }
+                _ => {}
+            }
+        }
+        windows.extend(started.map(|from| (lambda, from, i64::MAX)));
+    }
+    windows.sort_by_key(|(_, from, _)| *from);
+    let mut groups: Vec<Vec<ModelWindow>> = Vec::new();
+    let mut end = i64::MIN;
+    for window in windows {
+        match groups.last_mut() {
+            Some(group) if window.1 <= end => group.push(window),
+            _ => groups.push(vec![window]),
+        }
+        end = end.max(window.2);
+    }
+    groups
+}
+
+/// Pseudo-random numbers, the same in each run (SplitMix64).
+pub struct SeededRandom(pub u64);
+
+impl SeededRandom {
+    pub fn below(&mut self, n: u64) -> i64 {
+        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+        ((z ^ (z >> 31)) % n) as i64
+    }
 }

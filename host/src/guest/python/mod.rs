@@ -9,10 +9,10 @@ use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use gleaner_base::programs::{InstallationError, InstalledPrograms, RejectedPython};
 use gleaner_base::{Exit, Explain};
-use gleaner_jail::cgroup::CGROUP_ENV;
-use gleaner_parts::{Parts, PartsError, RejectedPython};
 use gleaner_protocol::LAYERS_ENV;
+use gleaner_sandbox::cgroup::CGROUP_ENV;
 
 use crate::isolation::{self, SandboxPermissions};
 
@@ -25,7 +25,7 @@ const ONE_THREAD: [&str; 4] =
 #[derive(Debug, thiserror::Error)]
 pub enum PythonError {
     #[error(transparent)]
-    Parts(#[from] PartsError),
+    InstalledPrograms(#[from] InstallationError),
     #[error("cannot start `{}`", python.display())]
     Start { python: PathBuf, source: std::io::Error },
 }
@@ -33,7 +33,7 @@ pub enum PythonError {
 impl Explain for PythonError {
     fn help(&self) -> Option<String> {
         match self {
-            Self::Parts(error) => error.help(),
+            Self::InstalledPrograms(error) => error.help(),
             Self::Start { .. } => {
                 Some("name another interpreter: GLEANER_PYTHON=/path/to/python3".to_owned())
             }
@@ -42,7 +42,7 @@ impl Explain for PythonError {
 
     fn exit(&self) -> Exit {
         match self {
-            Self::Parts(error) => error.exit(),
+            Self::InstalledPrograms(error) => error.exit(),
             Self::Start { .. } => Exit::Usage,
         }
     }
@@ -66,12 +66,12 @@ fn interpreter(
     lambda_dir: &Path,
     args: &[OsString],
     mut permissions: SandboxPermissions,
-) -> Result<(PathBuf, Command), PartsError> {
-    let parts = Parts::find()?;
+) -> Result<(PathBuf, Command), InstallationError> {
+    let parts = InstalledPrograms::find()?;
     let (python, unused) = parts.python_and_unused_venv(Some(lambda_dir))?;
     if let Some(RejectedPython { path, reason }) = unused {
         let (environment, instead) = (path.display(), python.display());
-        tracing::warn!(%environment, %reason, %instead, "the lambda's environment is not used");
+        tracing::warn!(%environment, %reason, %instead, "cannot use the lambda's environment");
     }
     let mut command = Command::new(&python);
     // Isolated: neither PYTHONPATH nor the current folder decides what a lambda imports.

@@ -12,7 +12,7 @@ use super::bindings::gleaner::lambda::types::{
 use super::bindings::handles::{Field, Frame, Sample, Topic};
 use crate::api::data::DataErrorKind as Kind;
 use crate::api::{data, frame};
-use gleaner_image as image;
+use gleaner_pixels as image;
 
 /// Name of the interface, as in `wit/`.
 const DATA: &str = "gleaner:lambda/data@0.1.0";

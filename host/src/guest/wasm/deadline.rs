@@ -41,10 +41,6 @@ pub(super) struct ArmedCall<'a> {
 impl Deadline {
     /// A deadline for the guests of `engine`, whose limits are `shortest` or longer. Starts the
     /// ticker, which sleeps until a call runs.
-    ///
-    /// # Errors
-    ///
-    /// An error if the thread cannot be started.
     pub fn new(engine: &Engine, shortest: Duration) -> std::io::Result<Self> {
         let shared = Arc::new(TickerState {
             base: Instant::now(),

@@ -31,6 +31,10 @@ fn memory(&RefusedGrowth { limit, requested, allowed }: &RefusedGrowth) -> Fault
     Fault { kind: FaultKind::Memory, message, used: Some(requested), allowed: Some(allowed) }
 }
 
+fn plain(kind: FaultKind, message: impl Into<String>) -> Fault {
+    Fault { kind, message: message.into(), used: None, allowed: None }
+}
+
 /// Converts an error of a call that has used this time. The pair is fuel: used and allowed.
 pub(super) fn from_error(
     error: &wasmtime::Error,
@@ -42,60 +46,52 @@ pub(super) fn from_error(
     let data = error.downcast_ref::<DataError>();
     let host_calls =
         error.is::<OutOfFuel>() || matches!(data, Some(DataError::OutOfFuel(OutOfFuel)));
-    if trap == Some(&Trap::OutOfFuel) || host_calls {
-        return fuel(used, allowed);
+    match (trap, data) {
+        _ if trap == Some(&Trap::OutOfFuel) || host_calls => fuel(used, allowed),
+        (Some(Trap::Interrupt), _) => time.fault(""),
+        (_, Some(DataError::OutOfTime)) => {
+            time.fault("a call into the host takes longer than is left: ")
+        }
+        (Some(Trap::StackOverflow), _) => {
+            // The stack that another call would have needed is unknown.
+            let allowed = Some(hosted.allowed.stack.bytes());
+            Fault { allowed, ..plain(FaultKind::Stack, "the call stack is full") }
+        }
+        (_, Some(error @ DataError::OutOfHolds { .. })) => {
+            plain(FaultKind::HostCall, error.to_string())
+        }
+        _ => refused_call(error, hosted).unwrap_or_else(|| trapped(error, trap, hosted)),
     }
-    if trap == Some(&Trap::Interrupt) {
-        return time.fault("");
+}
+
+/// The fault of a call into the host that was refused, if `error` is one.
+fn refused_call(error: &wasmtime::Error, hosted: &Hosted) -> Option<Fault> {
+    if error.is::<SleepError>() {
+        return Some(plain(FaultKind::HostCall, SleepError.to_string()));
     }
-    if let Some(DataError::OutOfTime) = data {
-        return time.fault("a call into the host takes longer than is left: ");
-    }
-    if trap == Some(&Trap::StackOverflow) {
-        // The stack that another call would have needed is unknown.
-        let allowed = Some(hosted.allowed.stack.bytes());
-        return Fault {
-            kind: FaultKind::Stack,
-            message: "the call stack is full".to_owned(),
-            used: None,
-            allowed,
-        };
-    }
-    let plain = |kind, message| Fault { kind, message, used: None, allowed: None };
-    if let Some(error @ DataError::OutOfHolds { .. }) = data {
-        return plain(FaultKind::HostCall, error.to_string());
-    }
-    if error.downcast_ref::<SleepError>().is_some() {
-        return plain(FaultKind::HostCall, SleepError.to_string());
-    }
-    if error.downcast_ref::<I32Exit>().is_some() {
-        return plain(FaultKind::Trap, "the lambda called exit".to_owned());
+    if error.is::<I32Exit>() {
+        return Some(plain(FaultKind::Trap, "the lambda called exit"));
     }
     if let Some(ResourceTableError::Full) = error.downcast_ref() {
         let allowed = hosted.allowed.handles;
         let message = gleaner_rules::refused::too_many_handles(allowed);
-        return Fault {
-            kind: FaultKind::HostCall,
-            message,
-            used: Some(allowed + 1),
-            allowed: Some(allowed),
-        };
+        let (used, allowed) = (Some(allowed + 1), Some(allowed));
+        return Some(Fault { used, allowed, ..plain(FaultKind::HostCall, message) });
     }
-    if error.root_cause().to_string().starts_with(TOO_MUCH_DATA) {
+    error.root_cause().to_string().starts_with(TOO_MUCH_DATA).then(|| {
         let allowed = hosted.allowed.call_bytes;
         let message = format!("{TOO_MUCH_DATA}: at most {allowed} in one call");
-        return Fault {
-            kind: FaultKind::HostCall,
-            message,
-            used: None,
-            allowed: Some(allowed.bytes()),
-        };
-    }
+        Fault { allowed: Some(allowed.bytes()), ..plain(FaultKind::HostCall, message) }
+    })
+}
+
+/// The fault of a lambda that trapped, or was refused memory at its start.
+fn trapped(error: &wasmtime::Error, trap: Option<&Trap>, hosted: &Hosted) -> Fault {
     let printed = hosted.output.reason();
     // A guest that is refused memory at its start has no trap; later it aborts, and the refusal is
     // the cause. But a guest may also survive the refusal and panic for another reason. The
     // backtrace has a guest if it called the host, and none while its memories are created.
-    let starting = trap.is_none() && error.downcast_ref::<WasmBacktrace>().is_none();
+    let starting = trap.is_none() && !error.is::<WasmBacktrace>();
     let aborted = starting || trap == Some(&Trap::UnreachableCodeReached);
     let for_memory =
         printed.as_ref().is_none_or(|printed| printed.contains("memory allocation of"));
@@ -112,7 +108,7 @@ pub(super) fn from_error(
         Some(trap) => {
             plain(FaultKind::Trap, printed.map_or_else(|| trap.to_string(), with_way_out))
         }
-        None => plain(FaultKind::HostCall, format!("{}", error.root_cause())),
+        None => plain(FaultKind::HostCall, error.root_cause().to_string()),
     }
 }
 

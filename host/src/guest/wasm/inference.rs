@@ -1,7 +1,7 @@
 //! `gleaner:lambda/inference` over [`api::inference`](crate::api::inference).
 
+use gleaner_pixels::vision;
 use gleaner_protocol::inference as protocol;
-use gleaner_vision as vision;
 use wasmtime::component::Resource;
 
 use super::Hosted;

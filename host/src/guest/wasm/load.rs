@@ -7,11 +7,11 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use gleaner_artifacts::{DerivedEntry, StoreLookup, make_store};
+use gleaner_base::programs::{InstallationError, InstalledPrograms};
 use gleaner_base::{Exit, Explain, Failure};
 use gleaner_compile::{
     COMPILE_CPU_SECONDS, COMPILE_MEMORY_BYTES, CompileError, Nans, code_entry, read_component,
 };
-use gleaner_parts::{Parts, PartsError};
 use sha2::{Digest, Sha256};
 use wasmtime::component::{Component, Linker};
 use wasmtime::{Engine, Store};
@@ -26,7 +26,7 @@ pub enum WasmError {
     #[error(transparent)]
     Compile(#[from] CompileError),
     #[error(transparent)]
-    Parts(#[from] PartsError),
+    InstalledPrograms(#[from] InstallationError),
     #[error("cannot start `{}`", program.display())]
     Start { program: PathBuf, source: std::io::Error },
     #[error("{message}")]
@@ -56,7 +56,7 @@ impl Explain for WasmError {
     fn help(&self) -> Option<String> {
         match self {
             Self::Compile(error) => error.help(),
-            Self::Parts(error) => error.help(),
+            Self::InstalledPrograms(error) => error.help(),
             Self::World { .. } => Some(
                 "build it against this version's SDK: implement `Lambda` and export it with \
                  `gleaner_sdk::lambda!`; \
@@ -80,7 +80,7 @@ impl Explain for WasmError {
     fn exit(&self) -> Exit {
         match self {
             Self::Compile(error) => error.exit(),
-            Self::Parts(error) => error.exit(),
+            Self::InstalledPrograms(error) => error.exit(),
             Self::Compiler { exit, .. } => *exit,
             Self::Limit { .. } | Self::World { .. } => Exit::Usage,
             Self::Start { .. } | Self::Load { .. } => Exit::Internal,
@@ -101,10 +101,6 @@ pub struct Loaded {
 impl Loaded {
     /// Loads the component at `path`, and compiles it into `cache` first if necessary. It gets a
     /// stack of `stack_bytes`, and NaNs of this kind.
-    ///
-    /// # Errors
-    ///
-    /// [`WasmError`] names the component and the reason.
     pub fn open(
         path: &Path,
         cache: &Path,
@@ -129,10 +125,6 @@ impl Loaded {
     /// Takes the component at `path`, which a bench has compiled as `code` with other checks than
     /// [`gleaner_compile::settings`] has, to measure their cost. Without fuel, nothing but a
     /// deadline ends its code.
-    ///
-    /// # Errors
-    ///
-    /// As [`Loaded::open`].
     pub fn with_checks(
         path: &Path,
         code: &Component,
@@ -221,7 +213,7 @@ fn native_code(
 const COMPILE_THREADS: usize = 8;
 
 fn compile(path: &Path, cache: &Path, nans: Nans) -> Result<(), WasmError> {
-    let program = Parts::find()?.program("gleaner-compile")?;
+    let program = InstalledPrograms::find()?.program("gleaner-compile")?;
     let threads =
         std::thread::available_parallelism().map_or(1, |cores| cores.get().min(COMPILE_THREADS));
     let output = Command::new(&program)

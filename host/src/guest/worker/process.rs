@@ -7,8 +7,8 @@ use std::sync::mpsc::{self, Receiver, Sender};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use gleaner_base::programs::InstalledPrograms;
 use gleaner_base::{Exit, Failure, each_piece};
-use gleaner_parts::Parts;
 use gleaner_protocol::{ExitRecord, PASSES_INFERENCE};
 use rustix::event::{PollFd, PollFlags, poll};
 use rustix::io::ioctl_fionbio;
@@ -103,7 +103,7 @@ impl WorkerProcess {
         let failed = |what: &str, error: &dyn std::error::Error| {
             Failure::caused_by(Exit::Internal, what, error)
         };
-        let parts = Parts::find()?;
+        let parts = InstalledPrograms::find()?;
         let (shim, runtime) = (parts.program("gleaner-shim")?, parts.program("gleaner-runtime")?);
         let starter: OsString = format!("--starter={}", std::process::id()).into();
         let mut command = Command::new(&shim);

@@ -8,7 +8,7 @@ use std::time::Instant;
 use gleaner_base::Exit;
 use gleaner_lambda::Fault;
 use gleaner_protocol::Layer;
-use gleaner_vitals::usage;
+use gleaner_protocol::process_stats::usage;
 
 use super::{CallOutcome, TotalsMessage, WakeMessage, WorkerMessage};
 use crate::api::Session;

@@ -8,8 +8,8 @@ use gleaner_drives::Replay;
 use gleaner_journal::{Difference, InputView, JournalEntry, JournalHeader, WakeSource};
 use gleaner_lambda::FaultKind;
 use gleaner_lambda::manifest::Manifest;
+use gleaner_messages::transport::{SampleMeta, Transport};
 use gleaner_recorder::{ClipStatements, RecordError};
-use gleaner_transport::{SampleMeta, Transport};
 
 use super::lockstep::{LockstepDrive, LockstepError};
 use super::reference::{contradiction, unreadable_clip};
@@ -17,8 +17,8 @@ use super::triggers::{JournalTriggers, restarts};
 use super::{ReferenceJournal, Rerun, VerifyOutcome, counts_differ, different, seconds};
 use crate::api::data::{Tick, Topic, Wake};
 use crate::api::trace::offered;
-use crate::replay::ReplayOptions;
 use crate::replay::open::open;
+use crate::replay::options::ReplayOptions;
 use crate::session_setup::Load;
 
 /// Time by which a visible sample may be newer than the one that caused the wake, where each topic
@@ -70,23 +70,30 @@ pub(super) fn verify(
             .with_help(CHANGED));
     }
     let triggers = triggers.count;
+    let interrupted_note = note_interrupted(interrupted);
     if uncovered + interrupted == wakes || triggers > 0 && uncovered_triggers == triggers {
-        let message = format!("the clip alone proves no trigger of lambda `{}`", header.lambda);
-        let mut failure = Failure::new(Exit::Usage, message);
-        let what =
-            "in each wake that could prove one, the lambda had read samples from before the clip";
-        failure.causes = vec![format!("{what} ({uncovered} of {wakes} wakes)")];
-        failure.causes.extend(note_interrupted(interrupted));
-        let help = "make `preroll` longer than the lambda looks back";
-        return Err(match reference.is_live() {
-            true => failure.with_help(help),
-            false => failure
-                .with_help(format!("{help}; this clip can be verified against its drive: {DRIVE}")),
-        });
+        let uncovered = format!("{uncovered} of {wakes} wakes");
+        return Err(unproven(&header.lambda, &uncovered, interrupted_note, reference.is_live()));
     }
     let later = restarts(&stated, &header.lambda);
-    let notes = note_interrupted(interrupted).into_iter().chain(note_restarts(later)).collect();
+    let notes = interrupted_note.into_iter().chain(note_restarts(later)).collect();
     Ok(VerifyOutcome { wakes, triggers, uncovered, uncovered_triggers, notes })
+}
+
+/// The failure of a clip over which no decision could be compared.
+fn unproven(lambda: &str, uncovered: &str, note: Option<String>, is_live: bool) -> Failure {
+    let message = format!("the clip alone proves no trigger of lambda `{lambda}`");
+    let mut failure = Failure::new(Exit::Usage, message);
+    let what =
+        "in each wake that could prove one, the lambda had read samples from before the clip";
+    failure.causes = vec![format!("{what} ({uncovered})")];
+    failure.causes.extend(note);
+    let help = "make `preroll` longer than the lambda looks back";
+    match is_live {
+        true => failure.with_help(help),
+        false => failure
+            .with_help(format!("{help}; this clip can be verified against its drive: {DRIVE}")),
+    }
 }
 
 const CHANGED: &str = "the clip, or its journal, was changed after it was written";
@@ -190,24 +197,7 @@ impl ClipVerifyLoop<'_> {
             true => self.rerun.skip(wake, entry),
             false => self.rerun.wake(wake).clone(),
         };
-        for ((topic, before), (now, journal)) in
-            self.inputs.iter().zip(before).zip(now.seen.iter_mut().zip(&entry.seen))
-        {
-            // Some samples before the first wake may lie before the clip. A live clip may have a
-            // topic later than its wakes.
-            let is_first = self.wakes == 0 || self.is_live && before == 0;
-            if is_first && offered(topic) - before < journal.new {
-                (now.new, now.digest) = (journal.new, journal.digest);
-                now.newest = now.newest.or(journal.newest);
-            }
-            if offered(topic) == 0 {
-                // The newest sample lies before the clip.
-                now.newest = journal.newest;
-            }
-            if self.is_live {
-                self.without_refused(now, journal);
-            }
-        }
+        self.complete_views(&before, &mut now.seen, &entry.seen);
         let is_covered = self.covers(entry);
         if !is_covered {
             let JournalEntry { triggers, fault, log, .. } = entry.clone();
@@ -222,12 +212,10 @@ impl ClipVerifyLoop<'_> {
             }
         }
         if let Some(difference) = entry.differs_from(&now, &self.header.inputs, false) {
-            let saw_the_same = entry.at_ns == now.at_ns
-                && entry
-                    .seen
-                    .iter()
-                    .zip(&now.seen)
-                    .all(|(a, b)| InputView { reach: b.reach, ..*a } == *b);
+            let is_same =
+                |(a, b): (&InputView, &InputView)| InputView { reach: b.reach, ..*a } == *b;
+            let saw_the_same =
+                entry.at_ns == now.at_ns && entry.seen.iter().zip(&now.seen).all(is_same);
             return Err(match self.too_late(entry, &now).or_else(|| self.unknown_state()) {
                 Some(why) if saw_the_same => self.unsettled(entry, &difference, &why),
                 _ => self.differs(entry, &difference),
@@ -241,6 +229,29 @@ impl ClipVerifyLoop<'_> {
         }
         self.triggers.add(entry);
         Ok(())
+    }
+
+    /// Adds to the views of now what the clip cannot contain. `before` are the numbers of samples
+    /// before the wake.
+    fn complete_views(&self, before: &[u64], now: &mut [InputView], journal: &[InputView]) {
+        for ((topic, before), (now, journal)) in
+            self.inputs.iter().zip(before).zip(now.iter_mut().zip(journal))
+        {
+            // Some samples before the first wake may lie before the clip. A live clip may have a
+            // topic later than its wakes.
+            let is_first = self.wakes == 0 || self.is_live && *before == 0;
+            if is_first && offered(topic) - before < journal.new {
+                (now.new, now.digest) = (journal.new, journal.digest);
+                now.newest = now.newest.or(journal.newest);
+            }
+            if offered(topic) == 0 {
+                // The newest sample lies before the clip.
+                now.newest = journal.newest;
+            }
+            if self.is_live {
+                self.without_refused(now, journal);
+            }
+        }
     }
 
     /// Delivers the samples up to those that were newest in the first wake. Samples since the wake

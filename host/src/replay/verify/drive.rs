@@ -11,10 +11,10 @@ use gleaner_lambda::manifest::Manifest;
 use super::{ReferenceJournal, Rerun, VerifyOutcome, counts_differ, different, seconds};
 use crate::api::data::{Topic, Wake};
 use crate::api::trace::offered;
-use crate::replay::ReplayOptions;
 use crate::replay::digests::Digests;
 use crate::replay::drive_loop::{self, DriveHandler, DriveSpan};
 use crate::replay::open::{DriveError, open_drives};
+use crate::replay::options::ReplayOptions;
 use crate::schedule::WakeSchedule;
 use crate::session_setup::Load;
 

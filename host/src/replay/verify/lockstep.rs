@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use gleaner_drives::{Replay, ReplayError};
 use gleaner_messages::Definitions;
-use gleaner_transport::{
+use gleaner_messages::transport::{
     Delivery, DiscoveredTopic, SampleMeta, Sink, Subscription, TopicSpec, Transport, TransportError,
 };
 
@@ -23,7 +23,7 @@ const WAITING_COST: usize = 128;
 pub(super) enum LockstepError {
     #[error(transparent)]
     Drive(#[from] ReplayError),
-    #[error("more than {WAITING_BYTES} bytes of other inputs precede it")]
+    #[error("more than {WAITING_BYTES} bytes of other inputs precede the next sample")]
     TooFarAhead,
 }
 

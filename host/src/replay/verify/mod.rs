@@ -19,15 +19,15 @@ use std::time::Instant;
 use gleaner_base::{Exit, Failure};
 use gleaner_journal::{Difference, JournalEntry};
 use gleaner_lambda::manifest::Manifest;
+use gleaner_messages::transport::Transport;
 use gleaner_protocol::Verified;
-use gleaner_transport::Transport;
 
 use self::reference::different;
-use super::ReplayOptions;
 use crate::api::Session;
 use crate::api::data::{Topic, Wake};
 use crate::invoker::Invoker;
 use crate::journal::EntryBuilder;
+use crate::replay::options::ReplayOptions;
 use crate::session_setup::{Load, RunMode, SessionSetup, not_started};
 
 pub(super) fn run(

@@ -8,12 +8,12 @@ use gleaner_drives::{ReplayError, read_extras};
 use gleaner_journal::{Difference, JournalEntry, JournalError, JournalHeader, JournalReader};
 use gleaner_lambda::BuildDir;
 use gleaner_lambda::manifest::{ConfigSet, ConfigValue, Manifest, Tightened};
-use gleaner_recorder::{ClipStatements, FalseStatement};
+use gleaner_recorder::{ClaimMismatch, ClipStatements};
 use serde_json::Value;
 
 use crate::api::models::Models;
 use crate::input::Remap;
-use crate::journal::{CLOCK_OF_DRIVE, LambdaIdentity};
+use crate::journal::CLOCK_OF_DRIVE;
 use crate::replay::journal_file;
 use crate::replay::open::DriveError;
 use crate::replay::options::{Drives, ReplayOptions};
@@ -205,9 +205,7 @@ fn compare(
     lambda: &ConfiguredLambda,
     manifest: &Manifest,
 ) -> Result<(), Failure> {
-    let ConfiguredLambda { build, config, remaps, .. } = lambda;
-    let (engine, clock, part) = (header.engine.clone(), header.clock.as_str(), header.part);
-    let now = LambdaIdentity { manifest, build, config, remaps, engine, clock, part }.header()?;
+    let now = lambda.header(manifest, &header.engine, &header.clock, header.part)?;
     match header.differs_from(&now) {
         None => Ok(()),
         Some(difference) => Err(different(
@@ -232,7 +230,7 @@ pub(super) fn different(message: impl Into<String>, difference: &Difference) -> 
 /// The failure of a clip whose metadata contradicts its messages or its journal.
 pub(super) fn contradiction(
     path: &Path,
-    FalseStatement { what, stated, found }: &FalseStatement,
+    ClaimMismatch { what, stated, found }: &ClaimMismatch,
 ) -> Failure {
     let mut failure =
         Failure::new(Exit::Differs, format!("clip `{}` contradicts itself", path.display()));

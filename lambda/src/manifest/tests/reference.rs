@@ -38,7 +38,7 @@ fn the_reference_has_exactly_the_keys_that_are_parsed() {
 fn the_reference_has_the_defaults_of_the_parser() {
     let page = reference();
     let manifest = Manifest::parse(TICKER, "lambda.toml").unwrap();
-    for (key, value) in manifest.limits.in_words() {
+    for (key, value) in manifest.limits.describe() {
         let row = page.lines().find(|line| line.starts_with(&format!("| `{key}` |"))).unwrap();
         let plain = row.replace([',', '`', '"'], "");
         assert!(plain.contains(&format!("| {value} |")), "{value}: {row}");

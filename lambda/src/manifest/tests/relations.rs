@@ -1,7 +1,7 @@
 //! Tests refusals that involve several keys, or a file.
 
 use super::*;
-use crate::test_folder::TestFolder;
+use gleaner_test_support::TestFolder;
 
 #[test]
 fn a_duplicate_is_refused_with_both_lines() {

@@ -2,9 +2,10 @@
 
 use std::collections::BTreeMap;
 use std::os::fd::OwnedFd;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 
 use gleaner_base::{Exit, Failure};
-use gleaner_protocol::inference::{AddClient, ModelClient, report_state};
+use gleaner_protocol::inference::{AddClient, GrantedModel, ModelClient, report_state};
 use gleaner_protocol::link::LinkError;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
@@ -46,9 +47,31 @@ impl Client {
         self.models.iter().find(|passed| passed.model.sha256 == sha256)
     }
 
-    /// Refuses the models whose files have another digest; returns the reasons. Each other process
-    /// has one descriptor for each file that is kept.
+    /// Refuses the models whose files have another digest; returns the reasons.
     pub(super) fn check_files(&mut self) -> Vec<String> {
+        self.check_by(Self::refuse_others)
+    }
+
+    /// Refuses all models if `check` panics: the next lambda's are checked all the same.
+    fn check_by(&mut self, check: impl FnOnce(&mut Self) -> Vec<String>) -> Vec<String> {
+        catch_unwind(AssertUnwindSafe(|| check(self))).unwrap_or_else(|_| {
+            let AddClient { name: lambda, models, .. } = &mut self.add;
+            let refuse = |GrantedModel { name, sha256, refused, .. }: &mut GrantedModel| {
+                let digits = sha256.get(..8).unwrap_or(sha256);
+                let reason = format!(
+                    "model `{name}` (SHA-256 {digits}...) of lambda `{lambda}` is refused: the \
+                     check of its file failed, see standard error; a restart of the supervisor \
+                     tries again"
+                );
+                refused.insert(reason).clone()
+            };
+            models.iter_mut().map(refuse).collect()
+        })
+    }
+
+    /// Keeps one file for each digest, as each other process has a descriptor of each; returns why
+    /// the others are refused.
+    fn refuse_others(&mut self) -> Vec<String> {
         let mut refused = BTreeMap::new();
         for passed in std::mem::take(&mut self.models) {
             let sha256 = passed.model.sha256.clone();
@@ -139,6 +162,17 @@ mod tests {
                 (Some(&reason), 1)
             );
         }
+    }
+
+    #[test]
+    fn a_check_that_panics_refuses_the_models_of_its_lambda_by_name() {
+        let add = r#"{"id": "", "name": "any", "memory": 0, "models":
+            [{"name": "m", "sha256": "00", "providers": []}]}"#;
+        let add = serde_json::from_str(add).unwrap();
+        let (_lambda, mut client) = Client::pair(add, Vec::new()).unwrap();
+        let reasons = client.check_by(|_| panic!("of a test"));
+        assert!(reasons[0].starts_with("model `m` (SHA-256 00...) of lambda `any` is refused"));
+        assert_eq!(client.add.models[0].refused, reasons.first().cloned());
     }
 
     #[test]

@@ -5,21 +5,22 @@
 //! - `process`: one process. `blame`: the models that ended it several times.
 //! - `trial`: the first load of a model, in a process of its own.
 //! - `client`: the connection of a lambda, which outlives the process.
-//! - `passed_model`: a model as it is passed to the process. `engine`: its engine in the store.
+//! - `passed_model`: a model as it is passed to the process, with its engine in the store.
 //! - `totals`: the counts of the models over all processes.
-//! - `event`: what happens to the process, for the user.
 
 mod blame;
 mod client;
-mod engine;
-mod event;
 mod passed_model;
 mod process;
 mod service;
 mod totals;
 mod trial;
 
-pub use event::InferenceEvent;
+use std::path::Path;
+use std::time::Duration;
+
+use gleaner_protocol::inference::InferenceReport;
+
 pub use service::InferenceService;
 
 /// Program and name of the process.
@@ -31,5 +32,19 @@ pub enum InferenceUse<'a> {
     Shared,
     OneLambda,
     /// It builds engines into this folder.
-    Engines(&'a std::path::Path),
+    Engines(&'a Path),
+}
+
+/// Events of the process, for the user.
+pub enum InferenceEvent {
+    Report(InferenceReport),
+    /// A piece of its standard error.
+    Stderr(Vec<u8>),
+    /// It has ended without a request, for this reason, and is started again after the delay. True
+    /// for a fault of its own, false if it was killed, stood still or could not be started.
+    Ended(String, Duration, bool),
+    /// A model is refused for the rest of the run, for this reason.
+    Refused(String),
+    /// Something else went wrong.
+    Warning(String),
 }

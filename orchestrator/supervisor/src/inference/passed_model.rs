@@ -6,13 +6,13 @@ use std::os::unix::fs::FileExt;
 use std::path::Path;
 use std::sync::Arc;
 
-use gleaner_base::{Exit, Failure, PlainFile, hex};
+use gleaner_artifacts::{BuiltEngine, DerivedEntry, StoreError};
+use gleaner_base::programs::cache_dir;
+use gleaner_base::{Exit, Failure, PlainFile, chain, hex};
 use gleaner_lambda::layout::FILE_MAX;
 use gleaner_lambda::manifest::ModelSpec;
 use gleaner_protocol::inference::{GrantedModel, ModelEngine, ModelFile};
 use sha2::{Digest, Sha256};
-
-use super::engine;
 
 /// A model that the process may load.
 #[derive(Clone)]
@@ -45,7 +45,7 @@ impl PassedModel {
                 .with_help("build the lambda again: gleaner build DIR")
         })?;
         let (sha256, path) = (model.sha256.to_string(), model.file.to_string());
-        let (engine, entry) = match engine::stored(&sha256) {
+        let (engine, entry) = match stored_engine(&sha256) {
             Ok(Some(entry)) => (ModelEngine::Attached, Some(entry)),
             Ok(None) => (ModelEngine::None, None),
             Err(reason) => (ModelEngine::Refused(reason), None),
@@ -80,5 +80,18 @@ impl PassedModel {
             at += length as u64;
         }
         Ok(hex(&sha256.finalize()))
+    }
+}
+
+/// Opens the entry with the engine of the model with this SHA-256, if there is one. Otherwise
+/// returns the reason why it must not be used.
+fn stored_engine(sha256: &str) -> Result<Option<File>, String> {
+    let store = cache_dir().map_err(|error| chain(&error))?;
+    match DerivedEntry::of(&store, BuiltEngine::key(sha256)).open() {
+        // There is no store yet.
+        Err(StoreError::Read { source, .. }) if source.kind() == io::ErrorKind::NotFound => {
+            Ok(None)
+        }
+        found => found.map_err(|error| chain(&error)),
     }
 }

@@ -20,10 +20,10 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
+use gleaner_base::programs::InstalledPrograms;
 use gleaner_base::{Exit, Failure, chain};
 use gleaner_lambda::manifest::{Manifest, ScheduleSpec};
 use gleaner_lambda::{BuildDir, InferenceLimits};
-use gleaner_parts::Parts;
 use gleaner_protocol::inference::{
     AddClient, InferenceControl, InferenceReport, ModelMemory, TryLoad, models_in_use,
 };
@@ -38,8 +38,8 @@ use super::process::{Process, START, STEP};
 use super::totals::ModelTotals;
 use super::trial::LoadTrial;
 use super::{INFERENCE, InferenceEvent, InferenceUse};
+use crate::last_error::unexpected_end;
 use crate::lines::{next_report, pass_on};
-use crate::process::ended;
 use crate::restart_delay::{SILENCE, ServiceDelays, was_killed};
 
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
@@ -82,7 +82,7 @@ impl InferenceService {
     ///
     /// A failure if it cannot be started.
     pub fn start(
-        parts: &Parts,
+        parts: &InstalledPrograms,
         limits: &InferenceLimits,
         purpose: InferenceUse<'_>,
         events: impl Fn(InferenceEvent) + Send + Sync + 'static,
@@ -175,11 +175,14 @@ impl InferenceService {
         Ok(lambda_end)
     }
 
-    pub fn stop(mut self) {
-        self.end();
+    /// Ends the process, and waits for that.
+    pub fn stop(self) {
+        drop(self);
     }
+}
 
-    fn end(&mut self) {
+impl Drop for InferenceService {
+    fn drop(&mut self) {
         let mut state = self.shared.lock();
         state.stops = true;
         if let Some(control) = &state.control {
@@ -192,12 +195,6 @@ impl InferenceService {
             // It has reported a panic already.
             let _ = supervisor.join();
         }
-    }
-}
-
-impl Drop for InferenceService {
-    fn drop(&mut self) {
-        self.end();
     }
 }
 
@@ -298,7 +295,7 @@ impl Supervisor {
                 Ok(status) => {
                     is_killed = was_killed(status);
                     is_fault = !is_killed;
-                    ended(INFERENCE, status)
+                    unexpected_end(INFERENCE, status)
                 }
                 Err(reason) => reason,
             };

@@ -16,10 +16,10 @@ use gleaner_protocol::inference::{
 use super::blame::{ENDS_MAX, refusal};
 use super::passed_model::PassedModel;
 use super::{InferenceEvent, InferenceService};
+use crate::POLL_INTERVAL;
 use crate::last_error::LastError;
 use crate::restart_delay::RestartDelay;
 
-const POLL_INTERVAL: Duration = Duration::from_millis(100);
 /// Tries that show nothing about the model, as their process was ended from outside or could not be
 /// started. The pauses between them take 13 s: until then, the lambda waits and does not fail.
 const UNTRIED_MAX: usize = 8;

@@ -18,7 +18,7 @@ use gleaner_protocol::supervision::{
 use rustix::net::sockopt::{set_socket_send_buffer_size, socket_peercred};
 
 use crate::lines::next_report;
-use crate::output::{ChildId, ChildOutput, OutputPiece};
+use crate::output::{ChildOutput, NOTICE};
 
 /// Number of requests that wait for the loop. Each replaces those before it, and further ones wait
 /// in the socket.
@@ -44,10 +44,6 @@ struct Shared {
 
 impl Connection {
     /// Accepts orchestrators of the same user.
-    ///
-    /// # Errors
-    ///
-    /// A failure if no thread can be started.
     pub(super) fn accept(listener: UnixListener) -> Result<Self, Failure> {
         let (sender, requests) = sync_channel(REQUESTS);
         let shared = Arc::new(Shared::default());
@@ -141,10 +137,8 @@ impl Shared {
                     if requests.send((number, request)).is_err() {
                         return;
                     }
-                    let from = ChildId::Supervisor;
                     if let Some(bell) = &*lock(&self.bell) {
-                        // If it is full, the loop is awake.
-                        let _ = bell.try_send(ChildOutput { from, piece: OutputPiece::Bell });
+                        let _ = bell.try_send(NOTICE);
                     }
                 }
                 Err(error) => {

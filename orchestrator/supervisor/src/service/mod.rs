@@ -7,9 +7,9 @@
 //! It has no network and no keys, and runs no code but that of its programs. Its requests come
 //! over one socket, from a process of the same user.
 
-mod board;
 mod connection;
 mod serve;
+mod status_board;
 
 use std::os::fd::OwnedFd;
 use std::os::unix::net::UnixListener;
@@ -56,7 +56,7 @@ fn answer(argument: &str) -> Option<String> {
 
 fn listener() -> Result<UnixListener, Failure> {
     let unusable = |error: &dyn std::error::Error| {
-        Failure::caused_by(Exit::Usage, "standard input is no socket that listens", error)
+        Failure::caused_by(Exit::Usage, "standard input is not a listening socket", error)
             .with_help("`gleaner-orchestrator` starts this program")
     };
     let stdin: OwnedFd = rustix::io::fcntl_dupfd_cloexec(rustix::stdio::stdin(), 3)

@@ -7,21 +7,20 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use gleaner_base::programs::InstalledPrograms;
 use gleaner_base::{Exit, Failure, chain};
 use gleaner_lambda::{BuildDir, Manifest, Vehicle};
-use gleaner_parts::Parts;
 use gleaner_protocol::supervision::{
     DesiredLambda, DesiredState, EventKind, LAMBDAS_MAX, LambdaPhase, LambdaStatus,
     SUPERVISION_VERSION, SupervisionSpec, SupervisorReport, SupervisorRequest,
 };
 use signal_hook::consts::{SIGINT, SIGTERM};
 
-use super::board::Board;
 use super::connection::Connection;
+use super::status_board::StatusBoard;
 use crate::failures::Failures;
-use crate::group_end::GroupEnd;
 use crate::installation::Installation;
-use crate::process_group::{ProcessGroup, RunRecord};
+use crate::process_group::{GroupEnd, ProcessGroup, RunRecord};
 use crate::reconcile::{Action, KnownLambda, reconcile};
 use crate::restart_delay::{RestartDelay, jittered};
 use crate::revision_check::CheckFailure;
@@ -49,10 +48,11 @@ pub(super) fn serve(listener: std::os::unix::net::UnixListener) -> Result<(), Fa
     }
     let connection = Connection::accept(listener)?;
     let Some(spec) = configured(&connection, &stop) else { return Ok(()) };
-    let board = Board::open(&spec)?;
+    let board = StatusBoard::open(&spec)?;
     board.event(EventKind::Started, None, "the supervisor has started");
     let run = run_spec(&spec)?;
-    let context = RunContext { spec: &run, parts: Parts::find()?, offset_ns: clock_offset() };
+    let context =
+        RunContext { spec: &run, parts: InstalledPrograms::find()?, offset_ns: clock_offset() };
     let mut lambdas = Vec::new();
     let mut wanted = WantedState {
         spec: &spec,
@@ -158,7 +158,7 @@ struct WantedState<'a> {
     spec: &'a SupervisionSpec,
     installation: Installation,
     desired: DesiredState,
-    /// Set while the wanted state was not compared with what runs.
+    /// Set while the desired state was not compared with what runs.
     is_new: bool,
     unusable: Vec<UnusableLambda>,
 }
@@ -176,7 +176,7 @@ impl WantedState<'_> {
         &mut self,
         group: &mut ProcessGroup<'_>,
         connection: &Connection,
-        board: &Board,
+        board: &StatusBoard,
         stop: &AtomicBool,
     ) -> Result<GroupEnd, Failure> {
         let mut reported: (Option<Instant>, (_, Vec<_>)) = (None, ([false; 3], Vec::new()));
@@ -202,7 +202,7 @@ impl WantedState<'_> {
                 return Ok(end);
             }
             for lambda in group.lambdas.iter_mut() {
-                if lambda.is_leaving {
+                if lambda.is_leaving() {
                     lambda.kill_if_late(group.observer);
                 }
                 if let Some(reason) = lambda.take_quarantine() {
@@ -226,7 +226,7 @@ impl WantedState<'_> {
         until: Instant,
         lambdas: &[SupervisedLambda],
         connection: &Connection,
-        board: &Board,
+        board: &StatusBoard,
         stop: &AtomicBool,
     ) -> bool {
         let mut reported: Option<Instant> = None;
@@ -274,7 +274,7 @@ impl WantedState<'_> {
     }
 
     /// Starts and stops lambdas as wanted; returns whether it did any of that.
-    fn approach(&mut self, lambdas: &mut Vec<SupervisedLambda>, board: &Board) -> bool {
+    fn approach(&mut self, lambdas: &mut Vec<SupervisedLambda>, board: &StatusBoard) -> bool {
         // With many lambdas the comparison costs more than all else in this loop.
         let has_left = lambdas.iter().any(SupervisedLambda::has_left);
         if !std::mem::take(&mut self.is_new) && !has_left && self.unusable.is_empty() {
@@ -293,7 +293,7 @@ impl WantedState<'_> {
         });
         let running = lambdas.iter().filter_map(|it| {
             let lambda = it.lambda.deployment.as_deref()?;
-            Some(KnownLambda { lambda, is_leaving: it.is_leaving })
+            Some(KnownLambda { lambda, is_leaving: it.is_leaving() })
         });
         let unusable = self.unusable.iter();
         let unusable = unusable.map(|it| KnownLambda { lambda: &it.lambda, is_leaving: false });
@@ -345,7 +345,7 @@ impl WantedState<'_> {
         })
     }
 
-    fn status(&self, lambdas: &[SupervisedLambda], board: &Board) -> SupervisorReport {
+    fn status(&self, lambdas: &[SupervisedLambda], board: &StatusBoard) -> SupervisorReport {
         let mut status = board.status();
         status.generation = self.desired.generation;
         status.lambdas = lambdas.iter().filter_map(SupervisedLambda::status_report).collect();
@@ -386,10 +386,7 @@ fn check(state: &DesiredState) -> Result<(), String> {
     for lambda in &state.lambdas {
         let is_name = lambda.id.bytes().all(|it| it.is_ascii_alphanumeric() || b"-_".contains(&it));
         if lambda.id.is_empty() || !is_name {
-            return Err(format!(
-                "`{}` is no id of a deployment",
-                gleaner_base::excerpt(&lambda.id)
-            ));
+            return Err(format!("invalid deployment id `{}`", gleaner_base::excerpt(&lambda.id)));
         }
         if !ids.insert(&lambda.id) || !names.insert(&lambda.name) {
             return Err(format!("`{}` or its lambda `{}` is wanted twice", lambda.id, lambda.name));

@@ -187,7 +187,7 @@ class Lambda:
                 continue  # The descriptor of the listing.
             # The page that the shim watches has a size that cannot be changed.
             is_writable = stat.S_ISREG(mode) and flags & os.O_ACCMODE != os.O_RDONLY
-            if is_writable and "gleaner-pulse" not in path:
+            if is_writable and "gleaner-heartbeat" not in path:
                 writable.append(path)
         with open("/proc/self/cmdline") as file:
             out = next(word[6:] for word in file.read().split("\0") if word.startswith("--out="))

@@ -5,8 +5,8 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use gleaner_drives::{DriveOptions, Replay};
+use gleaner_messages::transport::{Transport, TransportError};
 use gleaner_messages::{FieldPath, Sources};
-use gleaner_transport::{Transport, TransportError};
 
 use super::bag::{add_text, add_topic, empty_database, folder};
 use crate::support::{MemorySink, TYPE, drive, file, listen, small_chunks, spec, ticking};

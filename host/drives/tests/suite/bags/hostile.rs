@@ -5,13 +5,11 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use gleaner_drives::{Damage, DamageLocation, DriveLimits, Replay, ReplayError};
-use gleaner_transport::Transport;
+use gleaner_messages::transport::Transport;
 use rusqlite::Connection;
 
 use super::bag::{TABLES, add_message, add_topic, cdr, empty_database, folder, new_database};
-use crate::support::{MemorySink, TYPE, expected, file, listen, run, spec, ticking};
-
-const TOPICS: [&str; 2] = ["/a", "/b"];
+use crate::support::{MemorySink, TOPICS, TYPE, begun, expected, file, listen, run, spec, ticking};
 
 pub fn damage(error: Option<ReplayError>) -> (DamageLocation, Damage) {
     match error {
@@ -35,8 +33,7 @@ fn refusal(path: &Path) -> String {
 
 /// Returns the messages that a database of one topic delivers, and the error at its end.
 fn replayed(path: &Path) -> (Vec<(i64, i64)>, Option<ReplayError>) {
-    let mut replay = Replay::open(&[path.to_owned()]).unwrap();
-    let memory = listen(&mut replay, &["/a"]);
+    let (mut replay, memory) = begun(&[path.to_owned()], &["/a"]);
     let (_, error) = run(&mut replay);
     (memory.values(), error)
 }

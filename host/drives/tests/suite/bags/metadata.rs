@@ -8,7 +8,7 @@ use gleaner_drives::{Replay, ReplayError};
 
 use super::bag::{Packing, Storage, bag, database, folder, metadata, write_metadata};
 use super::hostile::refused;
-use crate::support::{drive, file, listen, run, run_whole, small_chunks, ticking};
+use crate::support::{begun, drive, file, run, run_whole, small_chunks, ticking};
 
 #[test]
 fn metadata_that_are_a_link_out_of_the_directory_are_refused() {
@@ -97,8 +97,7 @@ fn a_higher_message_count_in_the_metadata_is_not_damage() {
     let folder = folder();
     database(&folder.path().join("drive_0.db3"), &messages[..40]);
     write_metadata(folder.path(), &metadata(5, "sqlite3", "", &["drive_0.db3"], &messages));
-    let mut replay = Replay::open(&[folder.path().to_owned()]).unwrap();
-    listen(&mut replay, &["/a"]);
+    let (mut replay, _) = begun(&[folder.path().to_owned()], &["/a"]);
     assert_eq!(replay.progress().total, Some(50));
     let steps = run_whole(&mut replay);
     assert_eq!(steps.len(), 40);
@@ -111,8 +110,7 @@ fn a_truncated_file_of_a_directory_is_damage() {
     let folder = folder();
     fs::rename(file(&bytes[..bytes.len() / 2]), folder.path().join("drive_0.mcap")).unwrap();
     write_metadata(folder.path(), &metadata(5, "mcap", "", &["drive_0.mcap"], &messages));
-    let mut replay = Replay::open(&[folder.path().to_owned()]).unwrap();
-    listen(&mut replay, &["/a"]);
+    let (mut replay, _) = begun(&[folder.path().to_owned()], &["/a"]);
     let (steps, error) = run(&mut replay);
     assert!(!steps.is_empty() && steps.len() < 50, "{}", steps.len());
     assert!(matches!(error, Some(ReplayError::Damaged { .. })), "{error:?}");

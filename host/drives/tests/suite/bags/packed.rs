@@ -7,15 +7,14 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, SystemTime};
 
 use gleaner_drives::{Damage, DriveLimits, DriveOptions, Replay, ReplayError, Unpacked, unpack};
-use gleaner_transport::{Delivery, SampleMeta, Sink, TopicSpec, Transport};
+use gleaner_messages::transport::{Delivery, SampleMeta, Sink, TopicSpec, Transport};
 
 use super::bag::{Packing, Storage, bag, cdr, folder, mcap_of, packed, unpack_in};
 use super::hostile::{damage, refused};
 use crate::support::{
-    MemorySink, drive, expected, file, listen, run, run_whole, small_chunks, spec, ticking,
+    MemorySink, TOPICS, begun, drive, expected, file, listen, run, run_whole, small_chunks, spec,
+    ticking,
 };
-
-const TOPICS: [&str; 2] = ["/a", "/b"];
 
 /// Takes messages up to a size, and notes the largest one offered.
 struct LimitedSink {
@@ -222,8 +221,7 @@ fn a_truncated_packed_file_delivers_the_messages_before_the_cut() {
         plain.extend((0..1_000_000_u32).map(|n| (n.wrapping_mul(2_654_435_761) >> 13) as u8));
         let bytes = packed(&plain);
         fs::write(&path, &bytes[..bytes.len() - 10]).unwrap();
-        let mut replay = Replay::open(std::slice::from_ref(&path)).unwrap();
-        let memory = listen(&mut replay, &TOPICS);
+        let (mut replay, memory) = begun(std::slice::from_ref(&path), &TOPICS);
         let (_, error) = run(&mut replay);
         damage(error);
         assert_eq!(memory.values(), expected(&messages), "{storage:?}");

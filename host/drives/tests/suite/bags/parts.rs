@@ -6,9 +6,7 @@ use std::path::PathBuf;
 use gleaner_drives::{Damage, Replay, ReplayError};
 
 use super::bag::{database_in, folder};
-use crate::support::{drive, expected, file, listen, run, small_chunks, ticking};
-
-const TOPICS: [&str; 2] = ["/a", "/b"];
+use crate::support::{TOPICS, drive, expected, file, listen, run, small_chunks, ticking};
 
 /// Returns the messages delivered of a part, and the error at its end.
 fn part(path: &PathBuf, from_ns: i64, to_ns: i64) -> (Vec<(i64, i64)>, Option<ReplayError>) {

@@ -3,18 +3,16 @@
 use std::fs;
 
 use gleaner_drives::{Progress, Replay, files_of};
-use gleaner_transport::Transport;
+use gleaner_messages::transport::Transport;
 
 use super::bag::{
     Packing, Storage, add_message, add_topic, bag, cdr, database, database_in, database_of,
     empty_database, folder, metadata, new_database, packed, unpack_in, write_metadata,
 };
 use crate::support::{
-    Written, delivered, drive, expected, file, listen, replayed, run, run_whole, small_chunks,
-    ticking,
+    TOPICS, Written, begun, delivered, drive, expected, file, listen, replayed, run, run_whole,
+    small_chunks, ticking,
 };
-
-const TOPICS: [&str; 2] = ["/a", "/b"];
 
 #[test]
 fn every_storage_and_packing_gives_the_same_messages() {
@@ -58,8 +56,7 @@ fn a_database_of_many_pieces_keeps_its_order_where_times_are_equal() {
     let folder = folder();
     let path = folder.path().join("drive.db3");
     database_of(&path, &messages, |message| [cdr(message), vec![0; 400]].concat());
-    let mut replay = Replay::open(&[path]).unwrap();
-    let memory = listen(&mut replay, &TOPICS);
+    let (mut replay, memory) = begun(&[path], &TOPICS);
     let steps = run_whole(&mut replay);
     assert_eq!(steps.len(), 20_000);
     let taken = memory.0.lock().unwrap();
@@ -115,8 +112,7 @@ fn a_missing_message_count_is_unknown_and_not_zero() {
 #[test]
 fn a_writer_in_a_database_counts_up_without_numbers_of_its_own() {
     let folder = folder();
-    let mut replay = Replay::open(&[database_in(&folder, &ticking(&["/a"], 3, 1000))]).unwrap();
-    listen(&mut replay, &["/a"]);
+    let (mut replay, _) = begun(&[database_in(&folder, &ticking(&["/a"], 3, 1000))], &["/a"]);
     let (steps, _) = run(&mut replay);
     assert!(steps.iter().map(|step| step.meta.seq).eq([1, 2, 3]));
     assert!(steps.iter().all(|step| step.meta.publish_ns == step.at_ns));

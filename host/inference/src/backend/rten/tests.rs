@@ -4,7 +4,7 @@ use super::*;
 use crate::backend::ExecutionProvider;
 use crate::backend::elements::bytes;
 use crate::inspect::{ModelSignature, inspect};
-use crate::onnx::{
+use gleaner_test_support::onnx::{
     BOOL, FLOAT32, INT8, INT32, INT64, Proto, UINT8, constant, graph, model_with_opset, node,
     number_attribute, number_of, numbers_attribute, value, value_of,
 };

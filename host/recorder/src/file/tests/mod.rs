@@ -5,17 +5,19 @@ mod recover;
 mod sign;
 mod write;
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU32, Ordering};
 
+use gleaner_journal::{JournalHeader, JournalInput};
 use gleaner_lambda::manifest::LambdaKind;
 use gleaner_lambda::{Clip, ClipLambda, Moment, Recovered, TriggerKind};
-use gleaner_transport::{Guid, SampleMeta};
+use gleaner_messages::transport::{Guid, SampleMeta};
 
 use super::{
     ClipHeader, ClipTopicCounts, ClipTrailer, RecordingFolder, TopicSchema, UnfinishedClip,
 };
-use crate::support::TestDir;
 
 /// Returns a folder of clips, and the test's folder that has it.
 fn opened() -> (TestDir, RecordingFolder) {
@@ -35,7 +37,19 @@ fn record(folder: &mut RecordingFolder, base: &str) -> Clip {
     begun(folder, base, 6).finish(trailer()).unwrap()
 }
 
+/// A folder for one test, removed when the test ends.
+pub struct TestDir(pub PathBuf);
+
 impl TestDir {
+    pub fn new() -> Self {
+        static COUNT: AtomicU32 = AtomicU32::new(0);
+        let count = COUNT.fetch_add(1, Ordering::Relaxed);
+        let name = format!("gleaner-recorder-{}-{count}", std::process::id());
+        let folder = std::env::temp_dir().join(name);
+        fs::create_dir_all(&folder).unwrap();
+        Self(folder)
+    }
+
     fn path(&self, relative: &str) -> PathBuf {
         self.0.join(relative)
     }
@@ -56,6 +70,44 @@ impl TestDir {
         let mut names: Vec<_> = names.filter(|name| name != ".lock").collect();
         names.sort();
         names
+    }
+}
+
+impl Drop for TestDir {
+    fn drop(&mut self) {
+        let _ = fs::remove_dir_all(&self.0);
+    }
+}
+
+/// Returns all metadata records of a finished clip, read by the `mcap` crate.
+pub fn metadata(file: &[u8]) -> Vec<(String, BTreeMap<String, String>)> {
+    let records = mcap::read::LinearReader::new(file).unwrap();
+    let metadata = records.filter_map(|record| match record.unwrap() {
+        mcap::records::Record::Metadata(metadata) => Some((metadata.name, metadata.metadata)),
+        _ => None,
+    });
+    metadata.collect()
+}
+
+/// The header of a lambda that records.
+pub fn journal_header(name: &str) -> JournalHeader {
+    let input = JournalInput {
+        name: "numbers".to_owned(),
+        topic: "/a".to_owned(),
+        wire_topic: "/a".to_owned(),
+        type_name: "test_msgs/msg/Number".to_owned(),
+    };
+    JournalHeader {
+        gleaner: "0.1.0".to_owned(),
+        engine: "Python".to_owned(),
+        machine: "x".to_owned(),
+        lambda: name.to_owned(),
+        version: "1.2.3".to_owned(),
+        kind: LambdaKind::Python,
+        inputs: vec![input],
+        event_input: Some(0),
+        clock: "log time of the drive".to_owned(),
+        ..JournalHeader::default()
     }
 }
 

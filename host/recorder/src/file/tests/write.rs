@@ -5,7 +5,7 @@ use gleaner_base::Explain;
 use gleaner_journal::FileDigest;
 use gleaner_lambda::Clip;
 use gleaner_messages::Endian;
-use gleaner_transport::{Guid, SampleMeta, Transport};
+use gleaner_messages::transport::{Guid, SampleMeta, Transport};
 
 use super::super::clip_dir::PART;
 use super::super::sink::FileSink;
@@ -13,7 +13,6 @@ use super::super::unfinished::METADATA_MAX;
 use super::super::{ClipTrailer, MESSAGE_MAX, UnfinishedClip};
 use super::*;
 use crate::error::RecordError;
-use crate::support::metadata;
 
 fn named<'a>(
     records: &'a [(String, BTreeMap<String, String>)],
@@ -144,7 +143,7 @@ fn the_line_of_a_clip_keeps_a_hundred_moments_and_the_file_all() {
 #[test]
 fn a_clip_describes_a_lambda_by_its_journal() {
     let (scratch, mut folder) = opened();
-    let mut header = crate::support::member("hello", (1, 1, 1), &[]).header;
+    let mut header = journal_header("hello");
     header.config.insert("limit".to_owned(), 3.into());
     let model =
         |path: &str| FileDigest { path: path.to_owned(), bytes: 5, sha256: "ff".to_owned() };
@@ -207,7 +206,7 @@ fn a_message_or_record_that_is_too_large_is_refused() {
     add(&mut clip, 0, 3);
     assert_eq!(clip.finish(trailer()).unwrap().topics[0].messages, 3);
     let header = |bytes: usize| {
-        let mut header = crate::support::member("hello", (1, 1, 1), &[]).header;
+        let mut header = journal_header("hello");
         header.config.insert("text".to_owned(), "x".repeat(bytes).into());
         ClipTrailer { headers: vec![header.into()], ..trailer() }
     };

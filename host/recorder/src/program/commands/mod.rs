@@ -12,13 +12,13 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use gleaner_base::{RateLimit, visible};
-use gleaner_feed::FedTopic;
 use gleaner_lambda::TriggerKind;
+use gleaner_messages::transport::{ReceptionStatus, SampleMeta};
 use gleaner_protocol::link::CommandStatus;
-use gleaner_transport::{ReceptionStatus, SampleMeta};
+use gleaner_samples::SharedTopicReader;
 use tracing::warn;
 
-use super::samples::FedSamples;
+use super::samples::SampleReader;
 use crate::{Commanded, LambdaId, RecordError, Recorder};
 use request::{CommandError, CommandRequest};
 
@@ -34,7 +34,7 @@ const WHY_MAX: usize = 200;
 pub struct Commands {
     topic: String,
     /// The topic's messages, once it is attached.
-    messages: Option<FedSamples>,
+    messages: Option<SampleReader>,
     allowed: RateLimit,
     /// Messages beyond the rate limit.
     too_many: u64,
@@ -66,10 +66,10 @@ impl Commands {
     }
 
     /// Receives the messages of the topic from now on, or again from an ingress that was restarted.
-    pub fn attach(&mut self, fed: FedTopic) {
+    pub fn attach(&mut self, fed: SharedTopicReader) {
         match &mut self.messages {
             Some(messages) => messages.continue_in(fed),
-            None => self.messages = Some(FedSamples::new(fed)),
+            None => self.messages = Some(SampleReader::new(fed)),
         }
     }
 
@@ -199,7 +199,7 @@ impl Commands {
         }
         self.reported = (unread, Some(Instant::now()));
         let (too_many, too_long) = (unread.0 - reported.0.0, unread.1 - reported.0.1);
-        warn!(topic = %self.topic, too_many, too_long, "commands refused unread");
+        warn!(topic = %self.topic, too_many, too_long, "dropped commands: too many, or too long");
     }
 
     pub fn status(&self, network: Option<&ReceptionStatus>) -> CommandStatus {

@@ -3,7 +3,7 @@
 
 use super::open_clip::OpenClip;
 use crate::RecordError;
-use crate::preroll::{EntrySource, Preroll, Walked};
+use crate::preroll::{EntrySource, Preroll, PrerollCursor};
 use crate::recorder::sources::RecordedSources;
 use crate::recorder::writer::ClipDisk;
 use crate::window::{Group, Window};
@@ -33,7 +33,7 @@ pub struct Backfill {
     limit: i64,
     /// The stamp up to which all is settled after it, if known.
     settles: Option<i64>,
-    last: Option<Walked>,
+    last: Option<PrerollCursor>,
     /// The search for an image, which comes first.
     thumbnail_search: Option<ThumbnailSearch>,
 }
@@ -43,8 +43,8 @@ pub struct Backfill {
 struct ThumbnailSearch {
     topic: usize,
     until: i64,
-    last: Option<Walked>,
-    newest: Option<(i64, Walked)>,
+    last: Option<PrerollCursor>,
+    newest: Option<(i64, PrerollCursor)>,
 }
 
 impl Backfill {
@@ -69,7 +69,7 @@ impl Backfill {
 
     /// A backfill of the entries after `last`, for messages that could not be written when they
     /// came.
-    pub fn after(last: Option<Walked>, limit: i64) -> Backfill {
+    pub fn after(last: Option<PrerollCursor>, limit: i64) -> Backfill {
         Backfill { windows: Vec::new(), limit, settles: None, last, thumbnail_search: None }
     }
 

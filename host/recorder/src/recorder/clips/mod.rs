@@ -12,22 +12,23 @@ mod waiting;
 
 use std::sync::Arc;
 
-use gleaner_lambda::{Moment, TriggerKind};
-use gleaner_transport::SampleMeta;
+use gleaner_lambda::Moment;
+use gleaner_messages::transport::SampleMeta;
 
 pub use self::backfill::Budget;
 use self::open_clip::CloseReason;
 pub use self::open_clip::OpenClip;
 use self::progress::ClipsInProgress;
-use super::Material;
+use super::RecorderContext;
 use super::writer::ClipDisk;
 use crate::RecordError;
-use crate::window::{TriggerOutcome, WindowRules, WindowStep, Windows};
+use crate::window::{WindowStep, Windows};
 
 /// Windows, the clips that are being made of them, and finished ones.
 pub struct Clips {
-    windows: Windows,
-    progress: ClipsInProgress,
+    /// After a trigger or a command, [`Clips::act`] has to follow.
+    pub windows: Windows,
+    pub progress: ClipsInProgress,
     /// The reason why recording is suspended.
     held: Option<Arc<str>>,
     /// Triggers while recording is suspended.
@@ -42,23 +43,6 @@ impl Clips {
             held: None,
             disk_suppressed: 0,
         }
-    }
-
-    pub fn progress(&self) -> &ClipsInProgress {
-        &self.progress
-    }
-
-    pub fn progress_mut(&mut self) -> &mut ClipsInProgress {
-        &mut self.progress
-    }
-
-    pub fn add_lambda(&mut self, rules: WindowRules) -> usize {
-        self.windows.add(rules)
-    }
-
-    /// Returns the instant before which no clip will begin.
-    pub fn horizon(&self) -> i64 {
-        self.windows.horizon()
     }
 
     pub fn is_held(&self) -> bool {
@@ -80,17 +64,13 @@ impl Clips {
         self.windows.set_grace(grace_ns);
     }
 
-    pub fn set_grace(&mut self, grace_ns: i64) {
-        self.windows.set_grace(grace_ns);
-    }
-
     pub fn grow_length(&mut self, most_ns: i64) {
         self.windows.grow_length(self.progress.grow_length(most_ns));
     }
 
     /// Advances time to `now`, which history knows already. Pending steps come before old entries
     /// are dropped, as they may need them.
-    pub fn pass(&mut self, now: i64, material: &mut Material) -> Result<(), RecordError> {
+    pub fn pass(&mut self, now: i64, material: &mut RecorderContext) -> Result<(), RecordError> {
         self.windows.pass(now);
         self.run(material)?;
         if self.progress.is_settled() {
@@ -107,7 +87,7 @@ impl Clips {
         topic: usize,
         meta: &SampleMeta,
         cdr: &[u8],
-        material: &Material,
+        material: &RecorderContext,
     ) -> Result<u64, RecordError> {
         self.progress.write(topic, meta, cdr, &self.windows, material)
     }
@@ -122,28 +102,8 @@ impl Clips {
         self.progress.await_clip(lambda, moment, &self.windows);
     }
 
-    /// Applies a trigger; [`act`](Self::act) has to follow.
-    pub fn trigger(
-        &mut self,
-        lambda: usize,
-        kind: TriggerKind,
-        label: &str,
-        at_ns: i64,
-    ) -> TriggerOutcome {
-        self.windows.trigger(lambda, kind, label, at_ns)
-    }
-
-    pub fn command(
-        &mut self,
-        lambda: usize,
-        kind: TriggerKind,
-        label: &str,
-        at_ns: i64,
-    ) -> TriggerOutcome {
-        self.windows.command(lambda, kind, label, at_ns)
-    }
-
-    pub fn act(&mut self, material: &mut Material) -> Result<(), RecordError> {
+    /// Acts on the triggers and commands that the windows have got.
+    pub fn act(&mut self, material: &mut RecorderContext) -> Result<(), RecordError> {
         self.run(material)?;
         self.progress.gather(&self.windows);
         Ok(())
@@ -153,7 +113,7 @@ impl Clips {
         &mut self,
         lambda: usize,
         at_ns: i64,
-        material: &mut Material,
+        material: &mut RecorderContext,
     ) -> Result<(), RecordError> {
         if self.windows.end(lambda, at_ns)
             && let Some(clip) = self.progress.open()
@@ -164,8 +124,8 @@ impl Clips {
     }
 
     /// Does all pending work; live, long work is left for later.
-    pub fn run(&mut self, material: &mut Material) -> Result<(), RecordError> {
-        let budget = if self.progress.is_live() { Budget::NONE } else { Budget::ALL };
+    pub fn run(&mut self, material: &mut RecorderContext) -> Result<(), RecordError> {
+        let budget = if self.progress.is_live { Budget::NONE } else { Budget::ALL };
         self.run_within(budget, material)
     }
 
@@ -173,7 +133,7 @@ impl Clips {
     pub fn run_within(
         &mut self,
         mut budget: Budget,
-        material: &mut Material,
+        material: &mut RecorderContext,
     ) -> Result<(), RecordError> {
         let Clips { windows, progress, .. } = self;
         while progress.continue_backfill(&mut budget, windows, material)? && progress.has_room() {
@@ -212,11 +172,11 @@ impl Clips {
     }
 
     /// Ends the recording: completes open clips. Live, this waits for the disk.
-    pub fn finish(&mut self, end: i64, material: &mut Material) -> Result<(), RecordError> {
+    pub fn finish(&mut self, end: i64, material: &mut RecorderContext) -> Result<(), RecordError> {
         self.settle_all(material)?;
         while let Some(group) = self.windows.close() {
             let why = || Arc::from("the recording was stopped before the window ended");
-            let close = match self.progress.is_live() {
+            let close = match self.progress.is_live {
                 true => CloseReason::Early(end, why()),
                 false => CloseReason::EndOfDrive(end),
             };
@@ -224,14 +184,14 @@ impl Clips {
             self.run(material)?;
             self.settle_all(material)?;
         }
-        while !self.progress.disk().is_idle() {
+        while !self.progress.disk.is_idle() {
             self.progress.wait()?;
         }
         Ok(())
     }
 
     /// Does all pending work, however long it takes.
-    fn settle_all(&mut self, material: &mut Material) -> Result<(), RecordError> {
+    fn settle_all(&mut self, material: &mut RecorderContext) -> Result<(), RecordError> {
         loop {
             self.run_within(Budget::ALL, material)?;
             if self.progress.is_settled() {

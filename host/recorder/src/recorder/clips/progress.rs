@@ -1,42 +1,56 @@
 //! The clips that are being made, and the disk that they are written to.
 
 use gleaner_lambda::{Clip, Moment, TriggerKind};
-use gleaner_transport::SampleMeta;
+use gleaner_messages::transport::SampleMeta;
 
 use super::backfill::{Backfill, Budget};
 use super::finished::Finished;
 use super::open_clip::{CloseReason, OpenClip};
 use super::waiting::WaitingTriggers;
 use crate::RecordError;
-use crate::preroll::Walked;
-use crate::recorder::Material;
+use crate::preroll::PrerollCursor;
+use crate::recorder::RecorderContext;
 use crate::recorder::limits::RecorderLimits;
 use crate::recorder::writer::ClipDisk;
 use crate::window::{Group, Window, Windows};
 
-/// A clip of windows before the open one. All of it is in the past.
+/// The clip of the current windows.
+struct CurrentClip {
+    clip: OpenClip,
+    fill: ClipFill,
+}
+
+/// The part of the current windows that their clip has.
+enum ClipFill {
+    /// It has all of it: samples are written when they come.
+    UpToDate,
+    /// It lacks messages after this entry of the preroll, or after its begin: they could not be
+    /// written when they came.
+    Behind(Option<PrerollCursor>),
+    /// It is being filled from the preroll. Nothing is decided meanwhile.
+    Filling(Backfill),
+}
+
+/// A clip of windows before the open one. All of it is in the past, and nothing is decided while it
+/// is filled.
 struct LateClip {
     clip: OpenClip,
     group: Group,
-    limit: i64,
+    backfill: Backfill,
 }
 
 /// The clips that are being made. Windows decide when each begins and ends.
 pub struct ClipsInProgress {
-    disk: ClipDisk,
+    pub disk: ClipDisk,
     limits: RecorderLimits,
     /// True if live: long work is left for later, and losses upstream count.
-    is_live: bool,
+    pub is_live: bool,
     waiting: WaitingTriggers,
-    open: Option<OpenClip>,
+    open: Option<CurrentClip>,
     late: Option<LateClip>,
-    /// The backfill of `late`, or else of `open`. Nothing is decided while it runs.
-    backfill: Option<Backfill>,
-    /// The last entry before the messages that could not be written to `open` when they came.
-    behind: Option<Option<Walked>>,
     groups: u64,
     max_length_ns: i64,
-    finished: Finished,
+    pub finished: Finished,
 }
 
 impl ClipsInProgress {
@@ -48,37 +62,19 @@ impl ClipsInProgress {
             waiting: WaitingTriggers::default(),
             open: None,
             late: None,
-            backfill: None,
-            behind: None,
             groups: 0,
             max_length_ns,
             finished: Finished::default(),
         }
     }
 
-    pub fn is_live(&self) -> bool {
-        self.is_live
-    }
-
     /// The clip of the current windows.
     pub fn open(&mut self) -> Option<&mut OpenClip> {
-        self.open.as_mut()
+        self.open.as_mut().map(|open| &mut open.clip)
     }
 
     pub fn is_open(&self) -> bool {
         self.open.is_some()
-    }
-
-    pub fn disk(&self) -> &ClipDisk {
-        &self.disk
-    }
-
-    pub fn finished(&self) -> &Finished {
-        &self.finished
-    }
-
-    pub fn finished_mut(&mut self) -> &mut Finished {
-        &mut self.finished
     }
 
     /// Raises the length of the longest clip; returns it.
@@ -94,14 +90,15 @@ impl ClipsInProgress {
 
     /// Collects the triggers of the open clip.
     pub fn gather(&mut self, windows: &Windows) {
-        if let (Some(clip), Some(group)) = (&mut self.open, windows.open()) {
-            gather(&mut self.waiting, clip, group, windows.limit());
+        if let (Some(open), Some(group)) = (&mut self.open, windows.open()) {
+            gather(&mut self.waiting, &mut open.clip, group, windows.limit());
         }
     }
 
     /// Returns whether there is nothing left to decide.
     pub fn is_settled(&self) -> bool {
-        self.backfill.is_none() && self.behind.is_none() && self.disk.has_room()
+        let is_filled = |open: &CurrentClip| matches!(open.fill, ClipFill::UpToDate);
+        self.late.is_none() && self.open.as_ref().is_none_or(is_filled) && self.disk.has_room()
     }
 
     /// Returns whether the disk can take more.
@@ -119,15 +116,16 @@ impl ClipsInProgress {
     }
 
     pub fn preroll_moved(&mut self) {
-        if let Some(backfill) = &mut self.backfill {
-            backfill.restart();
+        if let Some(late) = &mut self.late {
+            late.backfill.restart();
         }
-        if let Some(behind) = &mut self.behind {
-            *behind = None;
+        let Some(CurrentClip { clip, fill }) = &mut self.open else { return };
+        match fill {
+            ClipFill::UpToDate => {}
+            ClipFill::Behind(last) => *last = None,
+            ClipFill::Filling(backfill) => backfill.restart(),
         }
-        if let Some(clip) = &mut self.open {
-            clip.unsettle();
-        }
+        clip.unsettle();
     }
 
     /// Writes a sample to the open clip, if it belongs there. Returns the group whose clip then has
@@ -138,23 +136,28 @@ impl ClipsInProgress {
         meta: &SampleMeta,
         cdr: &[u8],
         windows: &Windows,
-        material: &Material,
+        material: &RecorderContext,
     ) -> Result<u64, RecordError> {
-        let is_prompt = self.is_prompt(meta.at_ns, windows);
-        let (Some(clip), Some(group)) = (&mut self.open, windows.open()) else {
+        let (Some(CurrentClip { clip, fill }), Some(group)) = (&mut self.open, windows.open())
+        else {
             return Ok(0);
         };
         if !material.sources.covers(group, topic, meta.at_ns) {
             return Ok(0);
         }
+        // During a backfill, or while the clip is full, a sample waits in the preroll, so that the
+        // file is in order of arrival.
+        let is_up_to_date = matches!(fill, ClipFill::UpToDate);
+        let is_prompt =
+            !self.is_live || is_up_to_date && meta.at_ns <= windows.limit() && self.disk.has_room();
         if cdr.len() > self.limits.message_bytes {
             clip.tally(topic).refuse();
-        } else if is_prompt || !material.history.preroll().fits(cdr.len()) && self.disk.has_room() {
+        } else if is_prompt || !material.history.preroll.fits(cdr.len()) && self.disk.has_room() {
             clip.write(topic, meta, cdr, group, &material.sources)?;
         } else {
             // It is counted as too big if it cannot be kept; else a backfill writes it later.
-            if self.backfill.is_none() || self.late.is_some() {
-                self.behind.get_or_insert_with(|| material.history.preroll().newest());
+            if is_up_to_date {
+                *fill = ClipFill::Behind(material.history.preroll.newest());
             }
             return Ok(0);
         }
@@ -171,7 +174,9 @@ impl ClipsInProgress {
         encoded: &[u8],
         windows: &Windows,
     ) -> u64 {
-        let (Some(clip), Some(group)) = (&mut self.open, windows.open()) else { return 0 };
+        let (Some(CurrentClip { clip, .. }), Some(group)) = (&mut self.open, windows.open()) else {
+            return 0;
+        };
         if !(group.begin..=group.to.min(windows.limit())).contains(&at_ns) {
             return 0;
         }
@@ -196,43 +201,41 @@ impl ClipsInProgress {
         Ok(())
     }
 
-    /// Continues the backfill; `true` once there is none.
+    /// Continues backfills; `true` once there is none.
     pub fn continue_backfill(
         &mut self,
         budget: &mut Budget,
         windows: &Windows,
-        material: &mut Material,
+        material: &mut RecorderContext,
     ) -> Result<bool, RecordError> {
         loop {
-            let Some(mut backfill) = self.backfill.take() else {
-                match self.behind.take().filter(|_| self.open.is_some()) {
-                    Some(last) => self.backfill = Some(Backfill::after(last, windows.limit())),
-                    None => return Ok(true),
+            let (clip, group, backfill) = match (&mut self.late, &mut self.open, windows.open()) {
+                (Some(LateClip { clip, group, backfill }), ..) => (clip, &*group, backfill),
+                (None, Some(CurrentClip { clip, fill }), Some(group)) => {
+                    if let ClipFill::Behind(last) = fill {
+                        *fill = ClipFill::Filling(Backfill::after(*last, windows.limit()));
+                    }
+                    let ClipFill::Filling(backfill) = fill else { return Ok(true) };
+                    (clip, group, backfill)
                 }
-                continue;
+                _ => return Ok(true),
             };
-            let filled = match (&mut self.late, &mut self.open, windows.open()) {
-                (Some(late), ..) => Some((&mut late.clip, &late.group)),
-                (None, Some(clip), Some(group)) => Some((clip, group)),
-                _ => None,
-            };
-            if let Some((clip, group)) = filled {
-                let Material { sources, history } = &mut *material;
-                let preroll = history.preroll_mut();
-                if !backfill.step(clip, group, sources, preroll, &self.disk, budget)? {
-                    self.backfill = Some(backfill);
-                    return Ok(false);
-                }
-                // Entries that were evicted meanwhile.
-                let limit = backfill.limit();
-                for window in backfill.windows() {
-                    history.reach_back(clip, window, sources);
-                }
-                history.count_losses(clip, group, sources, limit);
-                gather(&mut self.waiting, clip, group, limit);
+            let RecorderContext { sources, history } = &mut *material;
+            let preroll = &mut history.preroll;
+            if !backfill.step(clip, group, sources, preroll, &self.disk, budget)? {
+                return Ok(false);
             }
+            // Entries that were evicted meanwhile.
+            let limit = backfill.limit();
+            for window in backfill.windows() {
+                history.reach_back(clip, window, sources);
+            }
+            history.count_losses(clip, group, sources, limit);
+            gather(&mut self.waiting, clip, group, limit);
             if let Some(late) = self.late.take() {
                 self.end_late(late, material)?;
+            } else if let Some(open) = &mut self.open {
+                open.fill = ClipFill::UpToDate;
             }
         }
     }
@@ -241,10 +244,11 @@ impl ClipsInProgress {
         &mut self,
         joined: Vec<Window>,
         windows: &Windows,
-        material: &mut Material,
+        material: &mut RecorderContext,
     ) -> Result<(), RecordError> {
         if let Some(group) = windows.open().cloned() {
-            self.open = Some(self.new_clip(&group, material));
+            let clip = self.new_clip(&group, material);
+            self.open = Some(CurrentClip { clip, fill: ClipFill::UpToDate });
         }
         self.settle(joined, i64::MIN, windows, material)
     }
@@ -254,12 +258,12 @@ impl ClipsInProgress {
         joined: Vec<Window>,
         fresh_from: i64,
         windows: &Windows,
-        material: &mut Material,
+        material: &mut RecorderContext,
     ) -> Result<(), RecordError> {
-        if let (Some(clip), Some(group)) = (&mut self.open, windows.open()) {
+        if let (Some(CurrentClip { clip, fill }), Some(group)) = (&mut self.open, windows.open()) {
             let limit = windows.limit();
             let backfill = backfill(clip, group, joined, limit, fresh_from, material)?;
-            self.backfill = Some(backfill);
+            *fill = ClipFill::Filling(backfill);
         }
         Ok(())
     }
@@ -270,9 +274,9 @@ impl ClipsInProgress {
         boundary: i64,
         before: &Group,
         windows: &mut Windows,
-        material: &mut Material,
+        material: &mut RecorderContext,
     ) -> Result<(), RecordError> {
-        let (Some(clip), Some(group)) = (&mut self.open, windows.open()) else {
+        let (Some(CurrentClip { clip, .. }), Some(group)) = (&mut self.open, windows.open()) else {
             return Ok(());
         };
         if !clip.has_nothing() {
@@ -280,7 +284,9 @@ impl ClipsInProgress {
             let full = std::mem::replace(clip, next);
             self.end(full, before, CloseReason::Full(boundary), material)?;
         }
-        let (Some(clip), Some(group)) = (&self.open, windows.open()) else { return Ok(()) };
+        let (Some(CurrentClip { clip, .. }), Some(group)) = (&self.open, windows.open()) else {
+            return Ok(());
+        };
         // A gap longer than a clip becomes no clips.
         if material.history.now().is_none_or(|now| now > windows.limit()) {
             let earliest = earliest(clip, group, material);
@@ -296,10 +302,12 @@ impl ClipsInProgress {
         &mut self,
         group: &Group,
         close: CloseReason,
-        material: &mut Material,
+        material: &mut RecorderContext,
     ) -> Result<(), RecordError> {
         match self.open.take() {
-            Some(clip) if !clip.is_pointless() => self.end(clip, group, close, material),
+            Some(CurrentClip { clip, .. }) if !clip.is_pointless() => {
+                self.end(clip, group, close, material)
+            }
             _ => Ok(()),
         }
     }
@@ -308,7 +316,7 @@ impl ClipsInProgress {
         &mut self,
         windows: Vec<Window>,
         group: Group,
-        material: &mut Material,
+        material: &mut RecorderContext,
     ) -> Result<(), RecordError> {
         let clip = self.new_clip(&group, material);
         self.fill_late(clip, windows, group, material)
@@ -319,18 +327,22 @@ impl ClipsInProgress {
         mut clip: OpenClip,
         windows: Vec<Window>,
         group: Group,
-        material: &mut Material,
+        material: &mut RecorderContext,
     ) -> Result<(), RecordError> {
         let limit = group.from.saturating_add(self.max_length_ns);
         let backfill = backfill(&mut clip, &group, windows, limit, i64::MIN, material)?;
-        self.backfill = Some(backfill);
-        self.late = Some(LateClip { clip, group, limit });
+        self.late = Some(LateClip { clip, group, backfill });
         Ok(())
     }
 
     /// A late clip is backfilled: completes it, or continues in a next one.
-    fn end_late(&mut self, late: LateClip, material: &mut Material) -> Result<(), RecordError> {
-        let LateClip { mut clip, mut group, limit: boundary } = late;
+    fn end_late(
+        &mut self,
+        late: LateClip,
+        material: &mut RecorderContext,
+    ) -> Result<(), RecordError> {
+        let LateClip { mut clip, mut group, backfill } = late;
+        let boundary = backfill.limit();
         if group.to <= boundary {
             return self.end(clip, &group, CloseReason::Complete, material);
         }
@@ -349,7 +361,7 @@ impl ClipsInProgress {
         mut clip: OpenClip,
         group: &Group,
         close: CloseReason,
-        material: &mut Material,
+        material: &mut RecorderContext,
     ) -> Result<(), RecordError> {
         let limit = if let CloseReason::Full(boundary) = close { boundary } else { i64::MAX };
         let uncertain = self.waiting.uncertain(group, limit);
@@ -361,7 +373,7 @@ impl ClipsInProgress {
         Ok(())
     }
 
-    fn new_clip(&mut self, group: &Group, material: &Material) -> OpenClip {
+    fn new_clip(&mut self, group: &Group, material: &RecorderContext) -> OpenClip {
         self.groups += 1;
         let (lambda, at_ns) = group.first;
         let opening = self.waiting.find(lambda, at_ns).cloned().unwrap_or_else(|| Moment {
@@ -377,19 +389,9 @@ impl ClipsInProgress {
     }
 
     fn flush(&mut self) -> Result<(), RecordError> {
-        let late = self.late.as_mut().map(|late| &mut late.clip);
-        self.open.iter_mut().chain(late).try_for_each(OpenClip::flush)
-    }
-
-    /// Returns whether a sample of this stamp may be written to the open clip when it comes. During
-    /// a backfill, or while the clip is full, it waits in the preroll, so that the file is in order
-    /// of arrival.
-    fn is_prompt(&self, at_ns: i64, windows: &Windows) -> bool {
-        !self.is_live
-            || self.behind.is_none()
-                && (self.backfill.is_none() || self.late.is_some())
-                && at_ns <= windows.limit()
-                && self.disk.has_room()
+        let late = self.late.iter_mut().map(|late| &mut late.clip);
+        let mut clips = self.open.iter_mut().map(|open| &mut open.clip).chain(late);
+        clips.try_for_each(OpenClip::flush)
     }
 }
 
@@ -400,9 +402,9 @@ fn backfill(
     windows: Vec<Window>,
     limit: i64,
     fresh_from: i64,
-    material: &mut Material,
+    material: &mut RecorderContext,
 ) -> Result<Backfill, RecordError> {
-    let Material { sources, history } = material;
+    let RecorderContext { sources, history } = material;
     windows.iter().for_each(|window| history.reach_back(clip, window, sources));
     history.count_losses(clip, group, sources, limit);
     history.begin_latched(clip, group, sources)?;
@@ -410,12 +412,12 @@ fn backfill(
 }
 
 /// The stamp of the earliest sample that is covered, but in no clip of the group.
-fn earliest(clip: &OpenClip, group: &Group, material: &Material) -> Option<i64> {
-    let Material { sources, history } = material;
-    let preroll = history.preroll();
+fn earliest(clip: &OpenClip, group: &Group, material: &RecorderContext) -> Option<i64> {
+    let RecorderContext { sources, history } = material;
+    let preroll = &history.preroll;
     let mut earliest = None;
     let mut next = preroll.next(None);
-    while let Some(place) = next.map(Walked::place) {
+    while let Some(place) = next.map(PrerollCursor::place) {
         let held = preroll.held(place);
         if held.source.as_topic().is_some() && clip.lacks(&held, group, i64::MAX, sources) {
             earliest = Some(earliest.map_or(held.at_ns, |at: i64| at.min(held.at_ns)));

@@ -12,8 +12,8 @@ mod thread;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use gleaner_lambda::Clip;
+use gleaner_messages::transport::SampleMeta;
 use gleaner_protocol::link::Loss;
-use gleaner_transport::SampleMeta;
 
 use crate::RecordError;
 use crate::file::{ClipHeader, RecordingFolder, TopicSchema};

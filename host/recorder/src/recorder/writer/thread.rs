@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::thread::{Builder, JoinHandle};
 use std::time::{Duration, Instant};
 
-use gleaner_transport::SampleMeta;
+use gleaner_messages::transport::SampleMeta;
 
 use super::file::{ClipCompletion, ClipFile};
 use super::{ClipOutcome, ClipSample};

@@ -1,12 +1,11 @@
 //! Makes the calls that the bytes of a sample list, with arbitrary arguments: the host must not be
 //! harmed.
 //!
-//! A program is a list of steps (`tests/operations`): a byte for the call, then its arguments. The
+//! A program is a list of steps (`test-support`): a byte for the call, then its arguments. The
 //! results of calls are held, and later steps use them by number, so that they occur in every
 //! order. Bytes beyond the end of the program are 0. Refusals are expected; only an explicit step
 //! panics.
 
-use gleaner_operations::{DriverStep, Extra, Operation};
 use gleaner_sdk::data::{Frame, Roi};
 use gleaner_sdk::inference::{DetectOptions, ElementType, Model, Placement, Preprocess, Tensor};
 use gleaner_sdk::log::{error, trace, warn};
@@ -14,6 +13,7 @@ use gleaner_sdk::{
     Config, Field, Lambda, Result, Sample, Topic, event, input, inputs, now_ns, scratch, start,
     stop,
 };
+use gleaner_test_support::operations::{DriverStep, Extra, Operation};
 
 /// Maximum number of steps in a wake: more would only burn its fuel.
 const STEPS: usize = 256;

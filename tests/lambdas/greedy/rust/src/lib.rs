@@ -2,7 +2,6 @@
 
 use gleaner_sdk::{Config, Error, Field, Frame, Lambda, Result, Sample, Topic, event, input, log};
 
-/// The lambda.
 pub struct Greedy {
     behaviour: String,
     bytes: u32,

@@ -6,7 +6,6 @@ use gleaner_sdk::{Config, Error, Lambda, Result, Tick, event, scratch};
 /// Bytes that are added in each wake until scratch is full.
 const BULK: usize = 100_000;
 
-/// The lambda.
 pub struct Keeper;
 
 impl Lambda for Keeper {

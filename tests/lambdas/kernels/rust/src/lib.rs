@@ -6,9 +6,7 @@ use gleaner_sdk::kernels::fft::{Real, Spectrum, band_power};
 use gleaner_sdk::kernels::{Image, downscale, histogram, luma, mean};
 use gleaner_sdk::{Config, Lambda, Result, Sample, event};
 
-/// Results of a kernel.
 pub struct KernelResult {
-    /// The kernel.
     pub kernel: &'static str,
     /// Digest of all results that are equal on every machine (FNV-1a, 64 bits).
     pub digest: u64,
@@ -17,10 +15,6 @@ pub struct KernelResult {
 }
 
 /// Runs each kernel over images of odd sizes, with padding, in every encoding.
-///
-/// # Errors
-///
-/// Only if a kernel has a defect.
 pub fn results() -> Result<Vec<KernelResult>> {
     let mut kernels = [
         Digest::of("mean_luma"),

@@ -2,7 +2,6 @@
 
 use gleaner_sdk::{Config, Error, Lambda, Result, Sample, event, input, log};
 
-/// The lambda.
 pub struct Misbehave {
     behaviour: String,
     held: Vec<Sample>,

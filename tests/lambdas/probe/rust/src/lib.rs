@@ -8,7 +8,6 @@ use gleaner_sdk::{
     stop,
 };
 
-/// The lambda.
 pub struct Probe {
     every: u64,
     camera: Topic,

@@ -3,7 +3,6 @@
 
 use gleaner_sdk::{Config, Field, Lambda, Result, Tick, Topic, event, input, now_ns};
 
-/// The lambda.
 pub struct Ticker {
     imu: Topic,
     forward: Field,

@@ -7,14 +7,14 @@ mod tally;
 use std::sync::Arc;
 
 use gleaner_lambda::{Clip, Moment};
-use gleaner_transport::{LatchedSample, SampleMeta};
+use gleaner_messages::transport::{LatchedSample, SampleMeta};
 
 use self::journals::ClipJournals;
 use self::name::clip_name;
-use self::tally::TopicTally;
+use self::tally::RecordedTopicCounts;
 use crate::RecordError;
 use crate::file::{CONTINUES, ClipHeader, ClipTrailer, names};
-use crate::preroll::{EntryMeta, Walked};
+use crate::preroll::{EntryMeta, PrerollCursor};
 use crate::recorder::limits::RecorderLimits;
 use crate::recorder::sources::RecordedSources;
 use crate::recorder::writer::{ClipCompletion, ClipSample, ClipWriter};
@@ -37,7 +37,7 @@ pub enum CloseReason {
 /// search of the whole preroll each time.
 #[derive(Copy, Clone, Debug)]
 pub struct Settled {
-    pub last: Walked,
+    pub last: PrerollCursor,
     pub newest: i64,
 }
 
@@ -63,7 +63,7 @@ pub struct OpenClip {
     from: i64,
     is_begun: bool,
     messages: u64,
-    tallies: Vec<TopicTally>,
+    tallies: Vec<RecordedTopicCounts>,
     moments: Vec<Moment>,
     journals: ClipJournals,
     /// Topics that it has the latched samples of, with the time at which these were valid.
@@ -135,7 +135,7 @@ impl OpenClip {
         self.continues && self.has_nothing()
     }
 
-    pub fn tally(&mut self, topic: usize) -> &mut TopicTally {
+    pub fn tally(&mut self, topic: usize) -> &mut RecordedTopicCounts {
         at(&mut self.tallies, topic)
     }
 
@@ -191,13 +191,13 @@ impl OpenClip {
 
     /// Returns the last entry that need not be searched again, if nothing is needed before
     /// `fresh_from`.
-    pub fn settled_before(&mut self, fresh_from: i64) -> Option<Walked> {
+    pub fn settled_before(&mut self, fresh_from: i64) -> Option<PrerollCursor> {
         self.settled = self.settled.filter(|settled| settled.newest < fresh_from);
         self.settled.map(|settled| settled.last)
     }
 
     /// Notes that entries up to `last`, with the stamp `at_ns`, need not be searched again.
-    pub fn settle(&mut self, last: Walked, at_ns: i64) {
+    pub fn settle(&mut self, last: PrerollCursor, at_ns: i64) {
         let newest = self.settled.map_or(at_ns, |settled| settled.newest.max(at_ns));
         self.settled = Some(Settled { last, newest });
     }
@@ -309,7 +309,7 @@ impl OpenClip {
             return Ok(());
         }
         let header = ClipHeader {
-            clock: sources.clock().to_owned(),
+            clock: sources.clock.to_owned(),
             from_ns: self.from(group),
             lambdas: sources.lambdas_of(group),
             moment: self.opening.clone(),
@@ -361,7 +361,7 @@ impl OpenClip {
             let name = sources.name(*lambda);
             format!("more triggers of {name} than counted: too many waited for their clip")
         }));
-        trailer.incomplete.extend_from_slice(sources.notes());
+        trailer.incomplete.extend_from_slice(&sources.notes);
         let (from, most) = (self.from(group), self.limits.message_bytes);
         for topic in topics {
             let short = &mut trailer.incomplete;

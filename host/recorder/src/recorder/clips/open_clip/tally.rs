@@ -5,7 +5,7 @@ use crate::file::ClipTopicCounts;
 use crate::recorder::sources::RecordedSources;
 
 #[derive(Clone, Debug)]
-pub struct TopicTally {
+pub struct RecordedTopicCounts {
     pub messages: u64,
     /// `None` if unknown.
     pub overwritten: Option<u64>,
@@ -19,9 +19,9 @@ pub struct TopicTally {
     pub latched_dropped: u64,
 }
 
-impl Default for TopicTally {
-    fn default() -> TopicTally {
-        TopicTally {
+impl Default for RecordedTopicCounts {
+    fn default() -> RecordedTopicCounts {
+        RecordedTopicCounts {
             messages: 0,
             overwritten: Some(0),
             too_big: Some(0),
@@ -33,7 +33,7 @@ impl Default for TopicTally {
     }
 }
 
-impl TopicTally {
+impl RecordedTopicCounts {
     pub fn refuse(&mut self) {
         self.too_big = self.too_big.map(|count| count + 1);
         self.huge += 1;
@@ -49,52 +49,18 @@ impl TopicTally {
         most: usize,
         short: &mut Vec<String>,
     ) -> ClipTopicCounts {
-        let TopicTally { messages, overwritten, too_big, lost, huge, is_aged, latched_dropped } =
-            *self;
+        let RecordedTopicCounts {
+            messages,
+            overwritten,
+            too_big,
+            lost,
+            is_aged,
+            huge: _,
+            latched_dropped: _,
+        } = *self;
         let schema = sources.schema(topic);
         let name = &schema.name;
-        match overwritten {
-            Some(0) => {}
-            Some(count) => {
-                let samples = plural(count, "sample");
-                short.push(format!(
-                    "preroll_size is too small: {samples} of {name} evicted from the preroll"
-                ));
-            }
-            None => short.push(format!(
-                "preroll_size is too small: samples of {name} evicted from the preroll, more than \
-                 counted"
-            )),
-        }
-        if huge > 0 {
-            let most = most >> 20;
-            short.push(format!(
-                "{} of {name} larger than {most} MiB, too large for a clip",
-                plural(huge, "sample")
-            ));
-        }
-        match too_big.map(|count| count.saturating_sub(huge)) {
-            Some(0) => {}
-            Some(count) => {
-                short.push(format!(
-                    "{} of {name} did not fit into the preroll: preroll_size",
-                    plural(count, "sample")
-                ));
-            }
-            None => {
-                short.push(format!(
-                    "samples of {name} did not fit into the preroll, more than counted: \
-                     preroll_size"
-                ));
-            }
-        }
-        if is_aged {
-            short.push(format!("a trigger came late: samples of {name} had left the preroll"));
-        }
-        if latched_dropped > 0 {
-            let samples = plural(latched_dropped, "earlier sample");
-            short.push(format!("{name} is latched: {samples} of it found no room"));
-        }
+        self.note_dropped(name, most, short);
         if !sources.has_seen(topic) {
             short.push(format!("no message of {name} was received before the clip ended"));
         }
@@ -113,6 +79,43 @@ impl TopicTally {
             lost,
             overwritten,
             too_big,
+        }
+    }
+
+    /// Notes the samples of the topic `name` that had no room.
+    fn note_dropped(&self, name: &str, most: usize, short: &mut Vec<String>) {
+        let samples = |count| plural(count, "sample");
+        match self.overwritten {
+            Some(0) => {}
+            Some(count) => short.push(format!(
+                "preroll_size is too small: {} of {name} evicted from the preroll",
+                samples(count)
+            )),
+            None => short.push(format!(
+                "preroll_size is too small: samples of {name} evicted from the preroll, more than \
+                 counted"
+            )),
+        }
+        if self.huge > 0 {
+            let (samples, most) = (samples(self.huge), most >> 20);
+            short.push(format!("{samples} of {name} larger than {most} MiB, too large for a clip"));
+        }
+        match self.too_big.map(|count| count.saturating_sub(self.huge)) {
+            Some(0) => {}
+            Some(count) => short.push(format!(
+                "{} of {name} did not fit into the preroll: preroll_size",
+                samples(count)
+            )),
+            None => short.push(format!(
+                "samples of {name} did not fit into the preroll, more than counted: preroll_size"
+            )),
+        }
+        if self.is_aged {
+            short.push(format!("a trigger came late: samples of {name} had left the preroll"));
+        }
+        if self.latched_dropped > 0 {
+            let samples = plural(self.latched_dropped, "earlier sample");
+            short.push(format!("{name} is latched: {samples} of it found no room"));
         }
     }
 }
