@@ -22,7 +22,7 @@ pub const LINES: &[(&str, usize, usize)] = &[
     ("lambda", 4402, 2169),
     ("orchestrator", 14890, 4104),
     ("pixels", 2436, 1553),
-    ("player", 2226, 793),
+    ("player", 2229, 793),
     ("protocol", 10023, 2772),
     ("report", 2687, 916),
     ("rules", 2620, 1179),

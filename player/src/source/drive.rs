@@ -143,12 +143,15 @@ impl Drive {
     }
 }
 
+/// The topics to play, and those of the drive, each with whether its images are decoded.
+type SubscribedTopics = (Vec<PlayedTopic>, Vec<(TopicSpec, bool)>);
+
 /// Subscribes the topics to play; returns them, and how the drive has them.
 fn subscribe(
     replay: &mut Replay,
     args: &Args,
     inbox: &Arc<Inbox>,
-) -> Result<(Vec<PlayedTopic>, Vec<(TopicSpec, bool)>), Failure> {
+) -> Result<SubscribedTopics, Failure> {
     let mut remaps = Remaps::of(args);
     let (mut topics, mut recorded) = (Vec::<PlayedTopic>::new(), Vec::new());
     for found in wanted(replay, &args.topics)? {

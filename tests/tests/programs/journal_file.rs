@@ -269,6 +269,6 @@ fn a_journal_is_not_written_over_a_drive() {
         &["--journal", drive.to_str().unwrap()],
     );
     run.must_exit(2);
-    assert!(run.stderr.contains("is no journal"), "{}", run.stderr);
+    assert!(run.stderr.contains("is not a journal"), "{}", run.stderr);
     assert_eq!(std::fs::read(drive).unwrap(), std::fs::read(sample_drive()).unwrap());
 }

@@ -197,7 +197,7 @@ pub fn cpu() {
     let cpu = demand.iter().find(|it| it.resource == "cpu").expect("it is listed");
     assert_eq!((cpu.asked, &*cpu.source), (0.01, "assumed: 10 wakes/s of 1 ms"));
     let shown = vehicle.succeeds(&["status"]);
-    assert!(shown.contains("cpu 0.01 cores of "), "{shown}");
+    assert!(shown.contains("cpu: 0.01 cores reserved of "), "{shown}");
     // The speed of the machine is measured once, in the background.
     vehicle.until("the speed", |vehicle| {
         let measured = fs::read_to_string(vehicle.path("state/measured.json")).ok()?;
