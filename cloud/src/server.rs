@@ -313,7 +313,7 @@ fn spawn_chores(chores: &mut JoinSet<()>, cloud: &Arc<Cloud>) {
 
 async fn store_seen(cloud: &Cloud) {
     if let Err(error) = cloud.store.seen(&cloud.hub.take_seen()).await {
-        tracing::warn!(reason = error.reason(), "could not save last-seen times; will retry");
+        tracing::warn!(reason = error.reason(), "could not save last-seen times");
     }
 }
 

@@ -2,6 +2,7 @@
 //! for the whole process.
 
 use gleaner_fuzz::{TARGETS, Target};
+use gleaner_test_support::random::XorShift64;
 
 /// Number of inputs made from the seeds of a target: one or two seconds' worth. Twenty times as
 /// many with `GLEANER_LONG=1`.
@@ -15,28 +16,21 @@ fn inputs(target: &Target) -> u32 {
 }
 
 /// Changes seeds with xorshift64: the same inputs in each run.
-struct SeedMutator(u64);
+struct SeedMutator(XorShift64);
 
 impl SeedMutator {
-    fn below(&mut self, n: usize) -> usize {
-        self.0 ^= self.0 << 13;
-        self.0 ^= self.0 >> 7;
-        self.0 ^= self.0 << 17;
-        (self.0 % n as u64) as usize
-    }
-
     /// One of the seeds, with some bytes changed, removed, or replaced from another seed.
     fn mutate(&mut self, seeds: &[Vec<u8>], longest: usize) -> Vec<u8> {
-        let mut bytes = seeds[self.below(seeds.len())].clone();
-        for _ in 0..=self.below(4) {
-            let (at, to) = (self.below(bytes.len() + 1), self.below(bytes.len() + 1));
-            match self.below(4) {
-                0 | 1 if at < bytes.len() => bytes[at] = self.below(256) as u8,
+        let mut bytes = seeds[self.0.below(seeds.len())].clone();
+        for _ in 0..=self.0.below(4) {
+            let (at, to) = (self.0.below(bytes.len() + 1), self.0.below(bytes.len() + 1));
+            match self.0.below(4) {
+                0 | 1 if at < bytes.len() => bytes[at] = self.0.below(256) as u8,
                 2 => drop(bytes.drain(at.min(to)..at.max(to))),
                 _ => {
-                    let other = &seeds[self.below(seeds.len())];
+                    let other = &seeds[self.0.below(seeds.len())];
                     bytes.truncate(at);
-                    bytes.extend(&other[self.below(other.len() + 1)..]);
+                    bytes.extend(&other[self.0.below(other.len() + 1)..]);
                 }
             }
         }
@@ -71,7 +65,7 @@ fn all_seeds_pass_their_checks_whole_truncated_and_changed() {
 
 fn check_mutations(target: &Target, check: fn(&[u8]) -> bool, seeds: &[Vec<u8>], times: u32) {
     let inputs = times * inputs(target);
-    let mut mutator = SeedMutator(0x9e37_79b9_7f4a_7c15);
+    let mut mutator = SeedMutator(XorShift64(0x9e37_79b9_7f4a_7c15));
     let started = std::time::Instant::now();
     let valid = (0..inputs).filter(|_| check(&mutator.mutate(seeds, target.longest))).count();
     println!(

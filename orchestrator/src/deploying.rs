@@ -169,7 +169,7 @@ impl Orchestrator {
 struct ReceivedDeployment<'d> {
     core: &'d Orchestrator,
     request: &'d DeployRequest,
-    /// That of the cloud, if it comes from there.
+    /// The wish of the cloud, if the deployment comes from there.
     wish: Option<&'d DesiredDeployment>,
     /// The envelopes of revisions that were sent with it.
     sent: BTreeMap<Sha256, String>,

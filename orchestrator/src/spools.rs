@@ -117,8 +117,9 @@ fn waiting(
 pub(crate) fn collect(lambdas: &Path, kept: &BTreeSet<String>) -> Vec<String> {
     // What cannot be listed or removed is in the log, and tried again at the next removal.
     let listed = if lambdas.exists() { entries(lambdas) } else { Ok(Vec::new()) };
-    let listed = listed
-        .inspect_err(|failure| tracing::warn!(%failure, "cannot list spools; none is deleted"));
+    let listed = listed.inspect_err(
+        |failure| tracing::warn!(%failure, "cannot list the spools of lambdas; they are kept"),
+    );
     let old = listed.into_iter().flatten().filter_map(|path| {
         let id = path.file_name()?.to_str().filter(|id| !kept.contains(*id))?.to_owned();
         remove(&path);

@@ -1,4 +1,4 @@
-//! For tests of drives and of sources: messages, a sink that keeps its samples, the example drive.
+//! For tests of drives and of sources: messages, sinks, the example drive.
 
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
@@ -28,6 +28,15 @@ impl MemorySink {
         let taken = self.0.lock().unwrap();
         let value = |cdr: &[u8]| i64::from_le_bytes(cdr.try_into().unwrap());
         taken.iter().map(|(meta, cdr)| (meta.at_ns, value(cdr))).collect()
+    }
+}
+
+/// A sink that takes all samples, and keeps none.
+pub struct DiscardSink;
+
+impl Sink for DiscardSink {
+    fn deliver(&self, _: &SampleMeta, _: &[u8]) -> Delivery {
+        Delivery::Taken
     }
 }
 

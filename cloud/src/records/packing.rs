@@ -100,7 +100,9 @@ pub(super) async fn remove_old(archive: &RecordArchive, grace_s: i64) -> CloudRe
     for sha256 in archive.store.unneeded_chunk_files(grace_s).await? {
         match archive.chunks.remove(&sha256).await {
             Ok(()) => removed.push(sha256),
-            Err(error) => tracing::warn!(sha256, %error, "could not write chunk file; will retry"),
+            Err(error) => {
+                tracing::warn!(sha256, %error, "could not delete a chunk file; will retry")
+            }
         }
     }
     if removed.is_empty() {

@@ -98,7 +98,7 @@ impl Announcer {
         interfaces: &[IpAddr],
     ) -> Self {
         let senders = senders(interfaces).unwrap_or_else(|error| {
-            debug!(%error, "could not repeat announcements");
+            debug!(%error, "cannot repeat announcements");
             Vec::new()
         });
         let group = SocketAddrV4::new(DISCOVERY_GROUP, port_of_samples(domain) - 1);

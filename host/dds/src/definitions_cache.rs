@@ -190,7 +190,10 @@ impl DefinitionsCache {
         let mut attempts = Attempts { times: query.before.times + 1, ..query.before };
         let entry = match outcome {
             QueryOutcome::Failed { why, retry: Retry::Unsent } => {
-                info!(type_name, why, "no node offers the definition of this type yet; will retry");
+                info!(
+                    type_name,
+                    why, "cannot ask a node for the definition of this type yet; will retry"
+                );
                 let pause = Some(Instant::now() + PAUSE);
                 CachedType::Missing(Missing { attempts: query.before, settled: false, pause })
             }

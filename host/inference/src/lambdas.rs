@@ -38,7 +38,7 @@ pub(crate) struct ReadyDescriptors {
 impl LambdaTable {
     pub(crate) fn add(&mut self, add: AddClient, socket: OwnedFd, files: Vec<PassedModel>) {
         if self.lambdas.len() >= LAMBDAS {
-            error!(lambda = add.name, "refused a lambda: {LAMBDAS} are already served");
+            error!(lambda = add.name, "more than {LAMBDAS} lambdas: this one gets no model");
         }
         self.last_id += 1;
         self.lambdas.insert(LambdaId(self.last_id), ConnectedLambda::new(add, socket, files));

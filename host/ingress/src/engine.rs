@@ -204,10 +204,7 @@ impl Ingress {
             return;
         }
         if self.readers.iter().any(|reader| reader.name == add.name) {
-            warn!(
-                reader = add.name,
-                "a reader of this name is connected already; the old one ends"
-            );
+            warn!(reader = add.name, "another reader of this name is connected; both are served");
         }
         match ConnectedReader::welcome(add, socket, &*self.source, Instant::now()) {
             Ok(reader) => self.readers.push(reader),

@@ -24,6 +24,7 @@ use gleaner_protocol::ingress::{
 use gleaner_protocol::link::Incoming;
 use gleaner_samples::Feed;
 use gleaner_samples::regions::ControlRegion;
+use gleaner_test_support::random::XorShift64;
 use libtest_mimic::{Arguments, Trial};
 
 /// The variable with the role of a child of this program.
@@ -240,13 +241,9 @@ fn hold() {
 
 /// Returns random numbers, other ones in each process.
 fn random() -> impl FnMut() -> u64 {
-    let mut state = 0x9e37_79b9_7f4a_7c15_u64.wrapping_mul(u64::from(std::process::id()) | 1);
-    move || {
-        state ^= state << 13;
-        state ^= state >> 7;
-        state ^= state << 17;
-        state
-    }
+    let seed = 0x9e37_79b9_7f4a_7c15_u64.wrapping_mul(u64::from(std::process::id()) | 1);
+    let mut random = XorShift64(seed);
+    move || random.number()
 }
 
 /// Writes garbage to its control page, and reads its socket never again.

@@ -19,6 +19,7 @@ use gleaner_protocol::ingress::{
 use gleaner_protocol::link::Incoming;
 use gleaner_samples::regions::{ControlRegion, KernelFutex, TopicRegion};
 use gleaner_samples::{Feed, FeedError, FeedEvent, SharedTopicReader};
+use gleaner_test_support::random::XorShift64;
 use rustix::fs::{MemfdFlags, SealFlags, fcntl_add_seals, memfd_create};
 
 /// Longer than any test takes.
@@ -304,13 +305,7 @@ fn a_connection_that_is_not_opened_or_opened_twice_is_an_error() {
 
 #[test]
 fn random_memory_of_a_topic_never_crashes_its_reader() {
-    let mut random = 0x2545_f491_4f6c_dd1d_u64;
-    let mut next = || {
-        random ^= random << 13;
-        random ^= random >> 7;
-        random ^= random << 17;
-        random
-    };
+    let mut random = XorShift64(0x2545_f491_4f6c_dd1d);
     for round in 0..100 {
         let flags = MemfdFlags::ALLOW_SEALING | MemfdFlags::CLOEXEC;
         let mut file = File::from(memfd_create("test", flags).unwrap());
@@ -318,7 +313,7 @@ fn random_memory_of_a_topic_never_crashes_its_reader() {
         let bits = [8, 16, 48, 64][round % 4];
         let words = LAYOUT.bytes_needed().unwrap() / 8;
         let bytes: Vec<u8> =
-            (0..words).flat_map(|_| (next() >> (64 - bits)).to_le_bytes()).collect();
+            (0..words).flat_map(|_| (random.number() >> (64 - bits)).to_le_bytes()).collect();
         file.write_all(&bytes).unwrap();
         let seals = SealFlags::SHRINK | SealFlags::GROW | SealFlags::FUTURE_WRITE | SealFlags::SEAL;
         fcntl_add_seals(&file, seals).unwrap();

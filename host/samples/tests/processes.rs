@@ -13,6 +13,7 @@ use gleaner_buffers::shared::{
     SharedReader, SharedWriter, WriterMemory,
 };
 use gleaner_samples::regions::{ControlRegion, KernelFutex, MappedTopic, TopicRegion};
+use gleaner_test_support::random::XorShift64;
 use libtest_mimic::{Arguments, Trial};
 
 const LAYOUT: SharedLayout = SharedLayout { depth: 8, slots: 64, slot_bytes: 4096 };
@@ -191,16 +192,15 @@ fn verify() {
 /// Writes garbage over its hazards until it is killed.
 fn garbage() {
     let (reader, control) = attached();
-    let mut state = 0x9e37_79b9_7f4a_7c15_u64.wrapping_mul(u64::from(std::process::id()));
+    let mut random =
+        XorShift64(0x9e37_79b9_7f4a_7c15_u64.wrapping_mul(u64::from(std::process::id())));
     loop {
         for word in 0..GARBAGE_WORDS {
-            state ^= state << 13;
-            state ^= state >> 7;
-            state ^= state << 17;
+            let state = random.number();
             // Half of the words name positions that are shown.
             let near = reader.head().saturating_sub(state % 16) << 16 | 0xffff;
             // SAFETY: this process holds nothing.
-            unsafe { control.overwrite(word, if state % 2 == 0 { state } else { near }) };
+            unsafe { control.overwrite(word, if state.is_multiple_of(2) { state } else { near }) };
         }
     }
 }

@@ -265,7 +265,7 @@ fn kept(step: Step) -> WantedProblem {
     WantedProblem {
         deployment: step.id().to_string(),
         envelope: step.envelope(),
-        title: "it keeps running here, although the cloud removed it".to_owned(),
+        title: "it stays on this vehicle, although the cloud does not want it".to_owned(),
         is_pending: true,
         causes: vec!["the cloud has an older state than this vehicle has applied".to_owned()],
         help: "after a restored backup, `gleaner vehicles agree NAME` lets the vehicle follow it"

@@ -309,7 +309,7 @@ async fn a_wanted_state_that_is_not_accepted_is_refused_and_what_runs_is_left_al
     for (generation, keeps) in [(1, false), (generation, true)] {
         channel.send(Body::Desired(Desired { generation, deployments: vec![], keeps })).await;
         let problems = channel.reported(generation).await.problems;
-        assert!(problems[0].is_pending && problems[0].title.contains("it keeps running here"));
+        assert!(problems[0].is_pending && problems[0].title.contains("it stays on this vehicle"));
         assert_eq!(vehicle.runs(), runs);
     }
     // Neither does another cloud. Once it wants the same, it can end it.

@@ -13,8 +13,9 @@ use std::time::{Duration, Instant};
 
 use gleaner_drives::Replay;
 use gleaner_lambda::Clip;
-use gleaner_messages::transport::{Delivery, SampleMeta, Sink, TopicSpec, Transport};
+use gleaner_messages::transport::{TopicSpec, Transport};
 use gleaner_recorder::RecordingFolder as Clips;
+use gleaner_test_support::drives::DiscardSink;
 use gleaner_test_support::random::XorShift64;
 use gleaner_tests::{LambdaCopy, TempFolder, program, root, runtime, sample_drive, times};
 use libtest_mimic::{Failed, Trial};
@@ -215,12 +216,6 @@ fn listed_names(out: &Path) -> Result<BTreeSet<String>, Failed> {
 
 /// Reads a clip to its end and checks all checksums.
 fn is_complete(path: &PathBuf) -> Result<(), Failed> {
-    struct DiscardSink;
-    impl Sink for DiscardSink {
-        fn deliver(&self, _: &SampleMeta, _: &[u8]) -> Delivery {
-            Delivery::Taken
-        }
-    }
     let failed =
         |error: &dyn std::error::Error| Failed::from(format!("{}: {error}", path.display()));
     let mut clip = Replay::open(std::slice::from_ref(path)).map_err(|error| failed(&error))?;

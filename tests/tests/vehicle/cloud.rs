@@ -212,9 +212,9 @@ pub fn restored() {
     vehicle.until("the connection", |_| cloud.vehicle(NAME).is_ahead.then_some(()));
     // Neither what it does not know nor a stop by it takes anything away before.
     let stop = cloud.gleaner(&["stop", "older", "--fleet", "--yes", "--timeout", "5s"]);
-    assert!(text(&stop).contains("car-7: it keeps running here"), "{}", text(&stop));
+    assert!(text(&stop).contains("car-7: it stays on this vehicle"), "{}", text(&stop));
     vehicle.until("what stays, by name", |_| {
-        cloud.succeeds(&["vehicles"]).contains("newer: it keeps running here").then_some(())
+        cloud.succeeds(&["vehicles"]).contains("newer: it stays on this vehicle").then_some(())
     });
     for id in ["older", "newer"] {
         assert_eq!(phase(&vehicle, id), Some(LambdaPhase::Running));

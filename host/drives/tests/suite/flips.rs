@@ -4,6 +4,8 @@ use std::process::Command;
 
 use gleaner_drives::{Replay, read_extras};
 use gleaner_messages::transport::Transport;
+use gleaner_test_support::drives::DiscardSink;
+use gleaner_test_support::random::XorShift64;
 use mcap::{Compression, WriteOptions};
 
 use crate::support::{begun, drive, file, run, small_chunks, spec, ticking};
@@ -16,18 +18,6 @@ fn peak_kib() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find(|line| line.starts_with("VmPeak:"))?;
     line.split_whitespace().nth(1)?.parse().ok()
-}
-
-/// A small generator with a fixed seed (xorshift64, G. Marsaglia 2003): failures repeat.
-struct XorShift(u64);
-
-impl XorShift {
-    fn below(&mut self, n: usize) -> usize {
-        self.0 ^= self.0 << 13;
-        self.0 ^= self.0 >> 7;
-        self.0 ^= self.0 << 17;
-        (self.0 % n as u64) as usize
-    }
 }
 
 #[test]
@@ -62,7 +52,7 @@ fn flip_random_bytes() {
     .map(|options| drive(options, &messages))
     .into();
     let before = peak_kib();
-    let mut random = XorShift(0x9e37_79b9_7f4a_7c15);
+    let mut random = XorShift64(0x9e37_79b9_7f4a_7c15);
     for case in 0..2000 {
         let mut bytes = drives[case % drives.len()].clone();
         for _ in 0..1 + random.below(4) {
@@ -76,7 +66,7 @@ fn flip_random_bytes() {
                 // A flip may have renamed the topic or its type.
                 let is_there = topics.iter().any(|name| name == topic);
                 if is_there && replay.definitions(topic).is_ok() {
-                    let _ = replay.subscribe(&spec(topic), std::sync::Arc::new(CountingSink));
+                    let _ = replay.subscribe(&spec(topic), std::sync::Arc::new(DiscardSink));
                 }
             }
             let (steps, _) = run(&mut replay);
@@ -92,17 +82,5 @@ fn flip_random_bytes() {
     for bytes in drives {
         let (mut replay, _) = begun(&[file(&bytes)], &["/a", "/b"]);
         assert_eq!(run(&mut replay).0.len(), messages.len());
-    }
-}
-
-struct CountingSink;
-
-impl gleaner_messages::transport::Sink for CountingSink {
-    fn deliver(
-        &self,
-        _: &gleaner_messages::transport::SampleMeta,
-        _: &[u8],
-    ) -> gleaner_messages::transport::Delivery {
-        gleaner_messages::transport::Delivery::Taken
     }
 }

@@ -10,6 +10,7 @@ use gleaner_buffers::shared::ControlMemory;
 use gleaner_protocol::ingress::{IngressLink, ReaderMessage};
 use gleaner_protocol::link::Incoming;
 use gleaner_samples::regions::ControlRegion;
+use gleaner_test_support::random::XorShift64;
 
 use crate::support::{RunningIngress, grant, wait_for};
 
@@ -20,17 +21,10 @@ const GARBAGE_WORDS: usize = 16;
 fn garbage_on_a_socket_ends_only_that_reader() {
     let (mut numbers, mut ingress) = RunningIngress::of_numbers("/number");
     let mut honest = ingress.reading("honest", grant(0, "/number"));
-    let mut random = 0x9e37_79b9_7f4a_7c15_u64;
+    let mut random = XorShift64(0x9e37_79b9_7f4a_7c15);
     for round in 0..50 {
         let mut socket = UnixStream::from(ingress.socket("hostile", vec![grant(0, "/number")]));
-        let garbage: Vec<u8> = (0..100 * (round + 1))
-            .map(|_| {
-                random ^= random << 13;
-                random ^= random >> 7;
-                random ^= random << 17;
-                random as u8
-            })
-            .collect();
+        let garbage: Vec<u8> = (0..100 * (round + 1)).map(|_| random.number() as u8).collect();
         // It fails if the ingress has closed the connection already.
         let _ = socket.write_all(&garbage);
         // A frame that seems valid, with a length that is never sent.
@@ -82,13 +76,10 @@ fn garbage_on_control_pages_neither_tears_samples_nor_stops_the_ingress() {
         for (seed, (_link, page)) in (1..).zip(&pages) {
             let stop = &stop;
             scope.spawn(move || {
-                let mut random = 0x9e37_79b9_7f4a_7c15_u64.wrapping_mul(seed);
+                let mut random = XorShift64(0x9e37_79b9_7f4a_7c15_u64.wrapping_mul(seed));
                 while !stop.load(std::sync::atomic::Ordering::Relaxed) {
                     for word in 0..GARBAGE_WORDS {
-                        random ^= random << 13;
-                        random ^= random >> 7;
-                        random ^= random << 17;
-                        overwrite(page, word, random);
+                        overwrite(page, word, random.number());
                     }
                     std::thread::yield_now();
                 }

@@ -80,8 +80,8 @@ pub(super) enum EndCause {
     /// No fault of its own: no process was started, as the machine lacks what the sandbox or a
     /// process needs.
     Shortage,
-    /// By another program: not its shim, nor the kernel for its memory. In its own code, a lambda
-    /// may have killed itself.
+    /// Another program killed it: not its shim, nor the kernel for its memory. In its own code, a
+    /// lambda may have killed itself.
     Killed,
 }
 

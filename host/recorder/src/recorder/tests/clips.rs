@@ -7,6 +7,7 @@ use crate::{RecordError, TOPICS_MAX, TopicSchema};
 use gleaner_base::Explain;
 use gleaner_lambda::TriggerKind::{Event, Start, Stop};
 use gleaner_protocol::RecordingCounts;
+use gleaner_test_support::drives::DiscardSink;
 
 #[test]
 fn a_clip_contains_exactly_its_window_and_describes_itself() {
@@ -77,7 +78,7 @@ fn a_clip_begins_with_the_samples_of_latched_topics_that_were_valid_then() {
     }
     let path = scratch.0.join(&first.file);
     let mut drive = gleaner_drives::Replay::open(&[path]).unwrap();
-    let sink = std::sync::Arc::new(Ignored);
+    let sink = std::sync::Arc::new(DiscardSink);
     for topic in gleaner_messages::transport::Transport::topics(&drive) {
         let spec = gleaner_messages::transport::TopicSpec {
             topic: topic.topic,
@@ -128,18 +129,6 @@ fn latched_samples_move_with_the_begin_of_a_clip() {
     of_tf.sort_unstable();
     // What was valid at both begins, and the one that came in between.
     assert_eq!(of_tf, [(1200, 1), (1600, 2), (2900, 1), (2900, 2)]);
-}
-
-struct Ignored;
-
-impl gleaner_messages::transport::Sink for Ignored {
-    fn deliver(
-        &self,
-        _: &gleaner_messages::transport::SampleMeta,
-        _: &[u8],
-    ) -> gleaner_messages::transport::Delivery {
-        gleaner_messages::transport::Delivery::Taken
-    }
 }
 
 #[test]
