@@ -8,7 +8,7 @@ use std::process::{Command, ExitCode, Stdio};
 use std::time::Instant;
 
 use gleaner_base::{Exit, Failure};
-use gleaner_bench_results::{BenchEnd, OUTPUT, SequenceEntry};
+use gleaner_bench::{BenchEnd, OUTPUT, SequenceEntry};
 use gleaner_tests::{find_program, root};
 
 use crate::live::until_end;
@@ -79,7 +79,7 @@ pub fn run(quick: bool, skip: &[String], out: Option<&Path>) -> Result<ExitCode,
             println!("[{}/{}] {bench}, about {duration}", index + 1, BENCHMARKS.len());
             (end, is_ended) = measure(bench, quick, &results)?;
         }
-        println!("{bench}: {}", line(&end));
+        println!("{bench}: {end}");
         entries.push(SequenceEntry {
             bench: (*bench).to_owned(),
             seconds: began.elapsed().as_secs_f64(),
@@ -89,7 +89,6 @@ pub fn run(quick: bool, skip: &[String], out: Option<&Path>) -> Result<ExitCode,
         write(&folder.join("summary.md"), &SequenceEntry::to_markdown(&entries))?;
     }
     write(&folder.join("machine-after.txt"), &facts())?;
-    println!("\n{}", SequenceEntry::to_markdown(&entries));
     let archive = pack(&out, &name)?;
     let size = archive.metadata().map_or(0, |data| data.len().div_ceil(1024));
     println!("all results in one file: {} ({size} KiB)", archive.display());
@@ -115,24 +114,6 @@ fn measure(bench: &str, quick: bool, folder: &Path) -> Result<(BenchEnd, bool), 
     command.stdin(Stdio::null()).stdout(output).stderr(errors);
     let (status, is_ended) = until_end(&mut command).map_err(failed)?;
     Ok((BenchEnd::read(folder, status.success(), &status.to_string()), is_ended))
-}
-
-fn line(end: &BenchEnd) -> String {
-    match end {
-        BenchEnd::Measured { goals, missed, skipped_parts } => {
-            let skipped = match skipped_parts.len() {
-                0 => String::new(),
-                parts => format!(", {parts} notes on skipped parts"),
-            };
-            let met = match goals {
-                0 => String::new(),
-                _ => format!(", {} of {goals} goals met", goals - missed),
-            };
-            format!("measured{met}{skipped}")
-        }
-        BenchEnd::Skipped(reason) => format!("skipped: {reason}"),
-        BenchEnd::Failed(reason) => format!("FAILED: {reason}"),
-    }
 }
 
 /// Returns the output of [`FACTS`]; what is missing here is named, too.

@@ -7,8 +7,8 @@ use std::time::Instant;
 use gleaner_protocol::{DriveInfo, ReplaySummary};
 use gleaner_tests::{TempFolder, bag, program, python_home, replay, root, sample_drive};
 
-use crate::measure::python;
-use gleaner_bench_results::{BenchResults, Figure};
+use gleaner_bench::python;
+use gleaner_bench::{BenchResults, Figure};
 
 /// Copies of the sample drive that make 2 GB.
 const ROUNDS: u64 = 265;

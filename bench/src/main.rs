@@ -1,7 +1,7 @@
 //! Measures Gleaner with the programs that users run. `cargo xtask bench` builds these first.
 //!
 //! Variants alternate, so that drift of the machine affects all of them alike. Each benchmark
-//! writes its results as JSON, as Markdown, and as a page with plots.
+//! writes its results as JSON; `bench/analysis` makes tables, figures and a page of them.
 
 mod all;
 mod answers;
@@ -21,18 +21,18 @@ use std::process::{Command, ExitCode};
 
 use clap::{Parser, Subcommand};
 use gleaner_base::Failure;
-use gleaner_bench_results::{BenchResults, Comparison};
+use gleaner_bench::BenchResults;
 use gleaner_tests::root;
+use isolation::BenchGuest;
 
 /// Measures Gleaner against its performance goals; ends with exit code 1 if one is not met.
 #[derive(Parser)]
-#[command(name = "gleaner-bench", bin_name = "cargo xtask bench")]
 #[command(version = gleaner_base::version())]
 struct Args {
-    /// Fewer and shorter rounds: shows that a benchmark works; the values mean nothing.
+    /// A smoke test with fewer and shorter rounds: its values are not meaningful.
     #[arg(long, global = true)]
     quick: bool,
-    /// Folder for results.json, results.md and report.html [default: target/bench/NAME].
+    /// Folder for results.json, tables, figures and report.html [default: target/bench/NAME].
     #[arg(long, global = true, value_name = "DIR")]
     out: Option<PathBuf>,
     #[command(subcommand)]
@@ -46,6 +46,12 @@ enum BenchCommand {
         /// A benchmark to leave out; may be repeated.
         #[arg(long, value_name = "NAME")]
         skip: Vec<String>,
+    },
+    /// The table and the figures of the paper: three workloads, each as native ROS 2, in Python and
+    /// in wasm, in 30 minutes; needs gleaner-player.
+    Paper {
+        #[command(flatten)]
+        options: rtt::PaperOptions,
     },
     /// Round trips from a sample to its answer, against a bare reader and programs without
     /// Gleaner; needs gleaner-player.
@@ -76,22 +82,29 @@ enum BenchCommand {
     Kernels,
     /// Detectors: a frame's way through gleaner-inference, by rten and, if ORT_DYLIB_PATH is set,
     /// by ONNX Runtime, against a plain Python program; several lambdas of one model.
-    Inference,
+    Inference {
+        #[command(flatten)]
+        options: inference::InferenceOptions,
+    },
     /// Runs as gleaner-runtime, with a guest that the product does not have.
     #[command(hide = true)]
     Guest {
         /// The guest.
-        guest: isolation::BenchGuest,
+        guest: BenchGuest,
         /// Arguments of gleaner-runtime.
         #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
         arguments: Vec<OsString>,
     },
-    /// Writes a model of the shape of YOLO11, with random weights, and measures nothing.
-    Model {
-        /// Scale of the model.
-        scale: inference::GraphScale,
-        /// The file to write.
-        file: PathBuf,
+    /// Runs as a native node without Gleaner.
+    #[command(hide = true)]
+    Node {
+        #[command(flatten)]
+        options: rtt::NodeOptions,
+    },
+    /// Makes the tables, the figures and the page of results anew.
+    Render {
+        /// The folder of the results.
+        folder: PathBuf,
     },
     /// Compares two results: effect size and interval of each measurement.
     Compare {
@@ -104,13 +117,22 @@ enum BenchCommand {
 
 fn main() -> ExitCode {
     gleaner_base::set_commit(option_env!("GLEANER_COMMIT"));
+    let mut arguments = std::env::args_os();
+    let program = arguments.next().map(PathBuf::from).unwrap_or_default();
+    // A copy in the place of the runtime, for a side without checks.
+    if program.file_name().is_some_and(|name| name == "gleaner-runtime") {
+        return isolation::run_as_runtime(BenchGuest::Unchecked, arguments.collect());
+    }
     let args = Args::parse();
     let done = match &args.command {
-        BenchCommand::Model { scale, file } => return write_model(*scale, file),
         BenchCommand::Guest { guest, arguments } => {
             return isolation::run_as_runtime(*guest, arguments.clone());
         }
-        BenchCommand::Compare { a, b } => compare(a, b),
+        BenchCommand::Node { options } => return rtt::run_node(options),
+        BenchCommand::Render { folder } => {
+            gleaner_bench::render(folder).map(|()| ExitCode::SUCCESS)
+        }
+        BenchCommand::Compare { a, b } => gleaner_bench::compare(a, b).map(|()| ExitCode::SUCCESS),
         BenchCommand::All { skip } => all::run(args.quick, skip, args.out.as_deref()),
         command => measure(command, &args),
     };
@@ -137,30 +159,51 @@ fn measure(command: &BenchCommand, args: &Args) -> Result<ExitCode, Failure> {
     {
         eprintln!("cannot bind to one core, measuring on all cores: {error}");
     }
+    let folder = args.out.clone().unwrap_or_else(|| root().join("target/bench").join(name));
     let quick = args.quick;
     let mut results = BenchResults::new(name, quick);
+    if command.is_resumed() {
+        results = BenchResults::read(&folder)?;
+    }
     add_versions(&mut results);
-    match command {
-        BenchCommand::Rtt { options } => rtt::measure(quick, options, &mut results),
-        BenchCommand::Scale { options } => live::loads(quick, options, &mut results),
-        BenchCommand::Isolation { options } => isolation::measure(quick, options, &mut results),
-        BenchCommand::ColdStart => drop(isolation::starts(quick, &mut results)),
-        BenchCommand::Replay => results.figures = replay::figures(quick),
-        BenchCommand::Record => results.figures = record::figures(quick),
-        BenchCommand::Drives => drives::measure(quick, &mut results),
-        BenchCommand::Kernels => results.figures = kernels::figures(quick),
-        BenchCommand::Inference => inference::measure(quick, &mut results),
-        BenchCommand::All { .. }
-        | BenchCommand::Guest { .. }
-        | BenchCommand::Model { .. }
-        | BenchCommand::Compare { .. } => {}
+    let measured = measure::caught(|| run(command, quick, &mut results, &folder));
+    let has_failed = measured.is_err();
+    if let Err(why) = &measured {
+        eprintln!("error: the benchmark `{name}` failed\n  cause: {why}");
+        results.notes.push(format!("The benchmark failed; the rows before it count: {why}"));
     }
     results.machine.add_load("load after");
-    let folder = args.out.clone().unwrap_or_else(|| root().join("target/bench").join(name));
-    print!("{}", results.to_markdown());
     results.store(&folder)?;
-    println!("\nresults and page: {}", folder.display());
-    Ok(ExitCode::from(u8::from(!results.is_good())))
+    gleaner_bench::render(&folder)?;
+    measured.unwrap_or(Ok(()))?;
+    Ok(ExitCode::from(u8::from(has_failed || !results.is_good())))
+}
+
+fn run(
+    command: &BenchCommand,
+    quick: bool,
+    results: &mut BenchResults,
+    folder: &Path,
+) -> Result<(), Failure> {
+    let mut save = |results: &BenchResults| results.store(folder);
+    match command {
+        BenchCommand::Rtt { options } => return rtt::measure(quick, options, results, &mut save),
+        BenchCommand::Paper { options } => return rtt::paper(quick, options, results, &mut save),
+        BenchCommand::Scale { options } => live::loads(quick, options, results),
+        BenchCommand::Isolation { options } => isolation::measure(quick, options, results),
+        BenchCommand::ColdStart => isolation::starts(quick, results),
+        BenchCommand::Replay => results.figures = replay::figures(quick),
+        BenchCommand::Record => results.figures = record::figures(quick),
+        BenchCommand::Drives => drives::measure(quick, results),
+        BenchCommand::Kernels => results.figures = kernels::figures(quick),
+        BenchCommand::Inference { options } => inference::measure(quick, options, results),
+        BenchCommand::All { .. }
+        | BenchCommand::Guest { .. }
+        | BenchCommand::Node { .. }
+        | BenchCommand::Render { .. }
+        | BenchCommand::Compare { .. } => {}
+    }
+    Ok(())
 }
 
 impl BenchCommand {
@@ -169,6 +212,7 @@ impl BenchCommand {
         match self {
             Self::All { .. } => "all",
             Self::Rtt { .. } => "rtt",
+            Self::Paper { .. } => "paper",
             Self::Scale { .. } => "scale",
             Self::Isolation { .. } => "isolation",
             Self::ColdStart => "cold-start",
@@ -176,9 +220,10 @@ impl BenchCommand {
             Self::Record => "record",
             Self::Drives => "drives",
             Self::Kernels => "kernels",
-            Self::Inference => "inference",
+            Self::Inference { .. } => "inference",
             Self::Guest { .. } => "guest",
-            Self::Model { .. } => "model",
+            Self::Node { .. } => "node",
+            Self::Render { .. } => "render",
             Self::Compare { .. } => "compare",
         }
     }
@@ -187,7 +232,16 @@ impl BenchCommand {
     fn is_live(&self) -> bool {
         match self {
             Self::Isolation { options } => options.has_attacks(),
-            Self::Rtt { .. } | Self::Scale { .. } => true,
+            Self::Rtt { .. } | Self::Paper { .. } | Self::Scale { .. } => true,
+            _ => false,
+        }
+    }
+
+    /// Returns whether it goes on with the results of an earlier run.
+    fn is_resumed(&self) -> bool {
+        match self {
+            Self::Rtt { options } => options.resume,
+            Self::Paper { options } => options.resume,
             _ => false,
         }
     }
@@ -211,25 +265,5 @@ fn add_versions(results: &mut BenchResults) {
     }
     machine.add_version("revision", &mut revision);
     machine.add_version("rustc", Command::new("rustc").arg("--version"));
-    machine.add_version("python", Command::new(measure::python()).arg("--version"));
-}
-
-fn compare(a: &Path, b: &Path) -> Result<ExitCode, Failure> {
-    let comparison = Comparison::between(&BenchResults::read(a)?, &BenchResults::read(b)?);
-    print!("{}", comparison.to_markdown());
-    Ok(ExitCode::SUCCESS)
-}
-
-fn write_model(scale: inference::GraphScale, file: &Path) -> ExitCode {
-    let (model, parameters) = inference::yolo_shaped(scale);
-    match std::fs::write(file, &model) {
-        Ok(()) => {
-            println!("{}: {parameters} parameters, {} bytes", file.display(), model.len());
-            ExitCode::SUCCESS
-        }
-        Err(error) => {
-            eprintln!("error: cannot write `{}`\n  cause: {error}", file.display());
-            ExitCode::FAILURE
-        }
-    }
+    machine.add_version("python", Command::new(gleaner_bench::python()).arg("--version"));
 }

@@ -1,11 +1,14 @@
 //! The two versions of a lambda, the cores that measure them, and the memory of a process.
 
 use std::fmt;
+use std::panic::{self, AssertUnwindSafe};
 use std::path::{Path, PathBuf};
 
-use gleaner_bench_results::Summary;
 use gleaner_tests::root;
 use rustix::time::{ClockId, clock_gettime};
+
+/// Lines that are kept of the message of a failure.
+const MESSAGE_LINES: usize = 20;
 
 /// The two versions of a lambda.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -38,11 +41,6 @@ impl Twin {
     }
 }
 
-/// The median of `values`, as tables have it; `None` without values.
-pub fn median(values: &[f64]) -> Option<f64> {
-    Summary::of(values).map(|summary| summary.median)
-}
-
 /// Microseconds for each of the `times` repetitions of `work`, and its result. Measured in CPU time
 /// of this thread: other work on the core matters only by its effect on the caches.
 pub fn timed<T>(times: u64, work: impl FnOnce() -> T) -> (f64, T) {
@@ -68,15 +66,19 @@ pub fn shuffled(count: usize, random: &mut u64) -> Vec<usize> {
     order
 }
 
-/// The Python of scripts that are compared with: that of `GLEANER_PYTHON`, of the checkout, or of
-/// the system.
-pub fn python() -> PathBuf {
-    let of_checkout = root().join(".venv/bin/python3");
-    match std::env::var_os("GLEANER_PYTHON") {
-        Some(python) => python.into(),
-        None if of_checkout.is_file() => of_checkout,
-        None => "python3".into(),
-    }
+/// Does `work`; the message of a panic is an error. The library of the tests, which starts programs
+/// and waits for them, panics where one fails, with its standard error.
+pub fn caught<T>(work: impl FnOnce() -> T) -> Result<T, String> {
+    let usual = panic::take_hook();
+    panic::set_hook(Box::new(|_| {}));
+    let done = panic::catch_unwind(AssertUnwindSafe(work));
+    panic::set_hook(usual);
+    done.map_err(|payload| {
+        let text = payload.downcast_ref::<String>().map(String::as_str);
+        let text = text.or_else(|| payload.downcast_ref::<&str>().copied());
+        let lines = text.unwrap_or("it ended without a message").trim().lines();
+        lines.take(MESSAGE_LINES).collect::<Vec<_>>().join("\n")
+    })
 }
 
 /// Binds this process and its children to the first core that it may use.

@@ -5,7 +5,7 @@
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use gleaner_bench_results::Figure;
+use gleaner_bench::Figure;
 use gleaner_protocol::{ReplaySummary, Report, Round};
 use gleaner_tests::drive::imu_only;
 use gleaner_tests::{TempFolder, program, replay, sample_drive};

@@ -2,7 +2,6 @@
 //!
 //! - [`ReportPage`] is `report.html`: decisions, their causes, losses and cost, in one
 //!   self-contained file.
-//! - [`MeasurementPage`] is the page of a benchmark, with plots and tables.
 //! - [`Diff`] holds the differences between two runs, decision by decision.
 //! - [`Decisions`], [`JsonLines`] and [`clips`] read a file line by line; [`mod@format`] formats
 //!   times, sizes and scores.
@@ -16,7 +15,6 @@
 
 mod diff;
 pub mod format;
-mod measurements;
 mod page;
 mod results;
 mod run_summary;
@@ -27,7 +25,6 @@ pub use diff::{
     ChangeCounts, ChangeKind, ComparedRun, Cost, Diff, DiffError, Difference, DifferenceKind,
     ValueChange,
 };
-pub use measurements::{MeasurementPage, MeasurementSection, Plot, PlotCurve, PlotTable};
 pub use page::ReportPage;
 pub use results::{Decisions, JsonLines, ResultsError, clips};
 pub use run_summary::{FileError, OutputError};

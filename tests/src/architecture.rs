@@ -10,7 +10,7 @@ use crate::tree::File;
 /// The files that may contain unsafe code. Each declares it below its `//!` lines, and states for
 /// each block why it is sound, unless it is [`GENERATED`].
 pub const UNSAFE_FILES: &[&str] = &[
-    "bench/parts/benches/parts.rs",
+    "bench/benches/parts.rs",
     "guest-sdk-rust/src/bindings.rs",
     "host/buffers/src/lease.rs",
     "host/buffers/src/pool.rs",

@@ -47,7 +47,7 @@ fn measure(checkout: &Checkout, name: &str, arguments: &[OsString]) -> Result<Ex
     setup::run(checkout, &mut steps, &checkout.lambdas(&FAMILIES))?;
     steps.begin("programs for comparison");
     venv::set_up_for_tests(checkout)?;
-    if ["rtt", "all"].contains(&name)
+    if ["rtt", "paper", "all"].contains(&name)
         && let Err(failure) = venv::apart(checkout, &checkout.target().join("baselines"), &STAND_IN)
     {
         println!("without the stand-in for ROS 2:\n{failure}");
@@ -61,7 +61,7 @@ fn measure(checkout: &Checkout, name: &str, arguments: &[OsString]) -> Result<Ex
 /// Measures single functions. Divan prints a table, and has options of its own.
 fn parts(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
     let mut bench = checkout.cargo();
-    bench.args(["bench", "--package", "gleaner-bench-parts", "--"]).args(arguments);
+    bench.args(["bench", "--bench", "parts", "--package", "gleaner-bench", "--"]).args(arguments);
     steps::run(&mut bench, "see the first error above").map(|()| Exit::Ok)
 }
 

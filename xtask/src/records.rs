@@ -78,7 +78,7 @@ const HEAVY: [HeavyPart; 8] = [
     },
     HeavyPart {
         name: "benches, quick: fleet",
-        packages: &["gleaner-fleet-bench", "gleaner-cloud"],
+        packages: &["gleaner-bench", "gleaner-cloud"],
         has_programs: false,
         files: &["xtask/src/bench.rs"],
         counted: (1, "measurements", "| "),
@@ -86,7 +86,7 @@ const HEAVY: [HeavyPart; 8] = [
     },
     HeavyPart {
         name: "cloud of three replicas, with kills",
-        packages: &["gleaner-fleet-bench", "gleaner-cloud"],
+        packages: &["gleaner-bench", "gleaner-cloud"],
         has_programs: false,
         files: &["xtask/src/fleet", "xtask/src/private_folder.rs"],
         counted: (4, "kills", "kill "),

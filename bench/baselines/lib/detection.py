@@ -10,6 +10,9 @@ import onnxruntime
 
 BORDER = (114, 114, 114)
 
+LIBRARIES = f"onnxruntime {onnxruntime.__version__}, OpenCV {cv2.__version__}"
+"""Libraries that detect, with their versions."""
+
 
 class Detector:
     """A model with its input and output of one layout."""
@@ -88,7 +91,26 @@ class Detector:
         inside = (end > start).all(1)
         boxes, scores, classes = boxes[inside], scores[inside], classes[inside]
         found = np.concatenate((start, end - start), 1)[inside]
-        kept = cv2.dnn.NMSBoxesBatched(boxes, scores, classes, min_score, max_iou)
-        kept = np.asarray(kept, int).reshape(-1)
+        kept = suppress(boxes, scores, classes, min_score, max_iou)
         kept = kept[np.argsort(-scores[kept], kind="stable")][:max_count]
         return [(int(classes[at]), float(scores[at]), found[at]) for at in kept]
+
+
+def suppress(
+    boxes: np.ndarray, scores: np.ndarray, classes: np.ndarray, min_score: float, max_iou: float
+) -> np.ndarray:
+    """Returns the indices, in rising order, of the boxes that overlap no better box of their class
+    by more than `max_iou`.
+
+    OpenCV handles all classes in one call since 4.7. Before, it takes a call for each class, and
+    only lists of floats in every version."""
+    if hasattr(cv2.dnn, "NMSBoxesBatched"):
+        kept = cv2.dnn.NMSBoxesBatched(boxes, scores, classes, min_score, max_iou)
+        return np.sort(np.asarray(kept, int).reshape(-1))
+    of_one_class = cv2.dnn.NMSBoxes
+    found = [np.empty(0, int)]
+    for number in np.unique(classes):
+        (members,) = np.nonzero(classes == number)
+        kept = of_one_class(boxes[members].tolist(), scores[members].tolist(), min_score, max_iou)
+        found.append(members[np.asarray(kept, int).reshape(-1)])
+    return np.sort(np.concatenate(found))

@@ -1,8 +1,8 @@
 """A baseline as a program: its command line, its lines on standard output, and its end. The
 middleware is in a node, which the caller of `run` makes.
 
-A line is a JSON object. The first one has `ready`, the last one the counts. Where the middleware
-is missing, the only line has `skipped`, and the exit code is 3.
+A line is a JSON object. The first one has `ready`, the last one the counts. Where a library is
+missing or fails, the only line has `skipped`, and the exit code is 3.
 """
 
 from __future__ import annotations
@@ -61,11 +61,13 @@ def run(
     options = parse(workloads.CONFIG, workloads.WITH_IMAGES)
     end = End()
     try:
+        # A failure, such as of an old library, becomes known here and not in a measurement.
+        workloads.probe(workloads.workload(options.workload, options.config))
         workload = workloads.workload(options.workload, options.config)
-    except ValueError as error:
+    except workloads.SettingError as error:
         fail("cannot configure the workload", error, "see [config] of the lambda", WRONG_USE)
-    except ImportError as error:
-        skip(error)
+    except Exception as error:
+        skip(error, f"cannot run workload `{options.workload}`")
     tally = Tally(options.name)
     try:
         node = open_node(options, workload, tally)
@@ -80,7 +82,7 @@ def run(
         workload=options.workload,
         config=options.config,
         depth=options.depth,
-        luma=workloads.LUMA,
+        luma=getattr(workload, "luma", None),
         model=getattr(workload, "runtime", None),
         versions=versions(*packages),
     )
@@ -92,9 +94,10 @@ def run(
     node.close()
 
 
-def skip(error: ImportError) -> NoReturn:
-    """Ends the program because a library is missing."""
-    line(skipped=f"cannot import `{error.name or 'a library'}`: {error}")
+def skip(error: Exception, what: str = "cannot start the node") -> NoReturn:
+    """Ends the program because a library is missing or fails."""
+    cause = f"{type(error).__name__}: {' '.join(str(error).split())}"
+    line(skipped=f"{what}: {cause}; bench/baselines/README.md lists what it needs")
     sys.exit(SKIPPED)
 
 

@@ -1,10 +1,13 @@
 """The workloads of the baselines: the decision on each message, from its arrival to the labels of
 the triggers. No middleware here.
 
-The rules are those of the lambdas in `examples/`, imported from there, so that lambda and baseline
-do the same arithmetic. A workload reads messages by the names of their fields, which are the same
-in every stack. It uses `header.stamp` where a lambda uses the time of reception: that is what a
-ROS node has.
+The rules are those of the lambdas, imported from their files, so that lambda and baseline do the
+same arithmetic. A workload reads messages by the names of their fields, which are the same in every
+stack. It uses `header.stamp` where a lambda uses the time of reception: that is what a ROS node
+has.
+
+Each workload imports the libraries that it needs when it is made, and no others: their memory
+counts as the node's.
 """
 
 from __future__ import annotations
@@ -12,18 +15,13 @@ from __future__ import annotations
 import importlib.util
 import sys
 from collections import deque
-from importlib import metadata
 from itertools import islice, takewhile
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Dict, Optional, Sequence, Tuple
 
 import numpy as np
 import numpy.typing as npt
-
-try:
-    import cv2
-except ImportError:
-    cv2 = None
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -40,6 +38,7 @@ Labels = Tuple[str, ...]
 CONFIG: Dict[str, Dict[str, float]] = {
     "empty": {},
     "imu-fft": {"window_s": 1.25, "rough": 0.5},
+    "imu-spectrum": {"rough": 0.09},
     "brake-dark": {"brake_mps2": -3.0, "dark_luma": 50.0},
     "yolo-detector": {"min_score": 0.4},
 }
@@ -51,14 +50,15 @@ WITH_IMAGES = ("brake-dark", "yolo-detector")
 CLASSES = ("person", "bicycle")
 """Classes that `yolo-detector` reports; the default is the manifest's."""
 
-LUMA = "numpy " + np.__version__ if cv2 is None else "cv2 " + cv2.__version__
-"""Library that computes the mean luma of a frame, with its version."""
+
+class SettingError(ValueError):
+    """A value of the command line that does not configure a workload."""
 
 
-def lambda_file(example: str) -> Any:
-    """Returns the file of a Python lambda in `examples/` as a module."""
-    path = ROOT / "examples" / example / "python" / "main.py"
-    spec = importlib.util.spec_from_file_location(example.replace("-", "_"), path)
+def lambda_file(folder: str) -> Any:
+    """Returns the file of the Python lambda in a folder of this repository as a module."""
+    path = ROOT / folder / "python" / "main.py"
+    spec = importlib.util.spec_from_file_location(path.parts[-3].replace("-", "_"), path)
     if spec is None or spec.loader is None:
         raise ImportError(f"cannot import lambda `{path}`")
     module = importlib.util.module_from_spec(spec)
@@ -80,20 +80,6 @@ def frame(image: Any) -> Pixels:
         raise ValueError(f"an image has encoding `{image.encoding}`; send `bgr8`")
     rows = np.frombuffer(image.data, np.uint8).reshape(image.height, image.step)
     return rows[:, : 3 * image.width].reshape(image.height, image.width, 3)
-
-
-def mean_luma(bgr: Pixels) -> float:
-    """Mean grey level, 0 to 255, of a frame as from `frame`.
-
-    OpenCV rounds the grey level of each pixel, as most nodes do; without it, the result is exact.
-    Source: luma weights of ITU-R BT.601."""
-    if cv2 is not None:
-        return float(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY).mean())
-    height, width, _ = bgr.shape
-    # Sums of whole rows first: 30 times as fast as a sum over both axes.
-    sums = bgr.reshape(height, -1).sum(axis=0, dtype=np.uint32).reshape(width, 3).sum(axis=0)
-    blue, green, red = (int(total) for total in sums)
-    return (114 * blue + 587 * green + 299 * red) / (1000 * (bgr.size // 3))
 
 
 class Ring:
@@ -132,7 +118,7 @@ class ImuFft:
     """`examples/imu-fft`: wakes on each IMU sample."""
 
     def __init__(self, window_s: float, rough: float) -> None:
-        self.road = lambda_file("imu-fft").Road(window_s)
+        self.road = lambda_file("examples/imu-fft").Road(window_s)
         self.rough = rough
         self.vertical = Ring(4096)
 
@@ -146,11 +132,32 @@ class ImuFft:
         return ("rough-road",) if score > self.rough else ()
 
 
+class ImuSpectrum:
+    """`bench/lambdas/imu-spectrum`: wakes on each IMU sample, with a spectrum in each wake."""
+
+    def __init__(self, rough: float) -> None:
+        rules = lambda_file("bench/lambdas/imu-spectrum")
+        self.score, self.samples = rules.score, rules.SAMPLES
+        self.rough = rough
+        self.vertical: deque[float] = deque(maxlen=self.samples)
+
+    def on_imu(self, imu: Any) -> Optional[Labels]:
+        self.vertical.append(imu.linear_acceleration.z)
+        if len(self.vertical) < self.samples:
+            return ()
+        score = self.score(np.fromiter(self.vertical, float, self.samples))
+        return ("rough-road",) if score > self.rough else ()
+
+
 class BrakeDark:
     """`examples/brake-dark`: wakes on each image, with the IMU as its second input."""
 
     def __init__(self, brake_mps2: float, dark_luma: float) -> None:
-        self.rules = lambda_file("brake-dark")
+        import luma
+
+        self.mean_luma = luma.mean_luma
+        self.luma = luma.LIBRARY
+        self.rules = lambda_file("examples/brake-dark")
         self.brake_mps2 = brake_mps2
         self.dark_luma = dark_luma
         self.forward = Ring(512)
@@ -166,7 +173,7 @@ class BrakeDark:
         mean = self.rules.braking(window, now, self.brake_mps2)
         if mean is None or not self.rules.rested(self.last_ns, now):
             return ()
-        if mean_luma(frame(image)) >= self.dark_luma:
+        if self.mean_luma(frame(image)) >= self.dark_luma:
             return ()
         self.last_ns = now
         return ("brake-dark",)
@@ -181,12 +188,11 @@ class YoloDetector:
     THREADS, MAX_IOU, MAX_COUNT = 1, 0.45, 100
 
     def __init__(self, min_score: float) -> None:
-        # The other workloads do without its libraries.
-        from detection import Detector
+        from detection import LIBRARIES, Detector
 
         models = ROOT / "examples" / "yolo-detector" / "python" / "models"
         self.detector = Detector(str(models / "yolox_nano.onnx"), "yolox", self.THREADS)
-        self.runtime = f"onnxruntime {metadata.version('onnxruntime')}, cpu, {self.THREADS} thread"
+        self.runtime = f"{LIBRARIES}, cpu, {self.THREADS} thread"
         self.names = (models / "coco.txt").read_text("utf-8").splitlines()
         self.min_score = min_score
 
@@ -206,22 +212,41 @@ def workload(name: str, config: Sequence[str]) -> Any:
     `on_imu` is called with each IMU message and `on_image`, where there is one, with each image.
     Both return the labels of the triggers; None if the message does not wake the workload.
 
-    Raises ValueError for an unknown key, and for a value that is not a number; ImportError without
-    a library of the workload."""
+    Raises SettingError for an unknown key, and for a value that is not a number; ImportError
+    without a library of the workload."""
     values = dict(CONFIG[name])
     for entry in config:
         key, equals, number = entry.partition("=")
         if not equals or key not in values:
             keys = f"write KEY=VALUE, of {', '.join(values)}" if values else "it takes no value"
-            raise ValueError(f"`{entry}` does not configure `{name}`: {keys}")
+            raise SettingError(f"`{entry}` does not configure `{name}`: {keys}")
         try:
             values[key] = float(number)
         except ValueError:
-            raise ValueError(f"`{number}` of `{key}` is not a number") from None
+            raise SettingError(f"`{number}` of `{key}` is not a number") from None
     kinds: Dict[str, Any] = {
         "empty": Empty,
         "imu-fft": ImuFft,
+        "imu-spectrum": ImuSpectrum,
         "brake-dark": BrakeDark,
         "yolo-detector": YoloDetector,
     }
     return kinds[name](**values)
+
+
+def probe(workload: Any) -> None:
+    """Sends made-up messages to a workload, which is of no use afterwards: three seconds of an IMU
+    in a car that brakes, and an image. Each workload gets as far as its last library with them.
+
+    Raises what the workload raises."""
+    on_image = getattr(workload, "on_image", None)
+    for n in range(300):
+        sec, hundredth = divmod(n, 100)
+        header = SimpleNamespace(stamp=SimpleNamespace(sec=sec, nanosec=hundredth * 10_000_000))
+        braking = SimpleNamespace(x=-1000.0, y=0.0, z=9.81)
+        workload.on_imu(SimpleNamespace(header=header, linear_acceleration=braking))
+    if on_image is not None:
+        width, height = 64, 48
+        size = {"width": width, "height": height, "step": 3 * width}
+        data = bytes(3 * width * height)
+        on_image(SimpleNamespace(header=header, encoding="bgr8", data=data, **size))

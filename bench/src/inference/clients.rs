@@ -4,7 +4,7 @@
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
-use gleaner_bench_results::{BenchResults, Figure, Series, SeriesGroup, quantile};
+use gleaner_bench::{BenchResults, Figure, Series, SeriesGroup, quantile};
 
 use super::frames::FrameFile;
 use super::lambda_path::LambdaPath;
@@ -52,8 +52,8 @@ pub(super) fn flood(
 ) {
     let period = PERIOD.as_millis();
     let name = format!("a call of {} each {period} ms, by rten", model.name);
-    let base = Some(ALONE.to_owned());
-    let mut group = SeriesGroup { name, unit: "ms".to_owned(), base, series: Vec::new() };
+    let bases = vec![ALONE.to_owned()];
+    let mut group = SeriesGroup { name, unit: "ms".to_owned(), bases, series: Vec::new() };
     let process = ModelProcess::start(model);
     let [mut patient, mut other] = [(); 2].map(|()| {
         let client = process.connect(model, "rten");
@@ -102,5 +102,6 @@ fn patient_calls(patient: &mut LambdaPath, calls: u32, name: &str, others: &Atom
         ("p50 of the run, ms".to_owned(), runs),
         ("calls of the other".to_owned(), count.to_string()),
     ];
-    Series { name: name.to_owned(), details: details.into(), reception: None, values: times }
+    let (name, details) = (name.to_owned(), details.into());
+    Series { name, details, values: times, ..Series::default() }
 }

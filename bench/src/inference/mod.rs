@@ -1,30 +1,28 @@
 //! Measures models: a frame's way through `gleaner-inference` against a plain Python program, the
 //! memory that several lambdas of one model take, and the effect of a lambda that floods.
 //!
-//! - `yolo_graph`: graphs of the shape of YOLO11. `graph_writer`: their nodes and weights.
 //! - `frames`: the frames, in a file. `python_program`: the Python program.
 //! - `model_process`: the process of the models. `lambda_path`: a lambda's way through it.
 //! - `clients`: several lambdas of one model.
 
 mod clients;
 mod frames;
-mod graph_writer;
 mod lambda_path;
 mod model_process;
 mod python_program;
-mod yolo_graph;
 
+use std::path::{Path, PathBuf};
+
+use clap::Args;
 use gleaner_pixels::vision::DetectorLayout;
 use gleaner_tests::{TempFolder, root};
 
 use crate::measure::{peak_mib, pss_mib};
 use frames::FrameFile;
-use gleaner_bench_results::{BenchResults, Series, SeriesGroup, quantile};
+use gleaner_bench::{BenchResults, Series, SeriesGroup, quantile};
 use lambda_path::LambdaPath;
 use model_process::{BenchModel, ModelProcess, digest};
 use python_program::{PythonProgram, PythonResult};
-
-pub use yolo_graph::{GraphScale, yolo_shaped};
 
 const THREADS: u32 = 1;
 /// Requirements for detections, the same for all programs.
@@ -34,15 +32,32 @@ const MAX_COUNT: u32 = 100;
 
 /// Runs before those that count.
 const WARM_UP: usize = 3;
+/// Runs that count.
+const FRAMES: usize = 200;
 
 /// The library of ONNX Runtime for `gleaner-inference`.
 const LIBRARY: &str = "ORT_DYLIB_PATH";
 
+/// The models of a run.
+#[derive(Args, Clone)]
+pub struct InferenceOptions {
+    /// A further model, with the layout of Ultralytics, such as a YOLO11m; may be repeated.
+    #[arg(long, value_name = "FILE")]
+    model: Vec<PathBuf>,
+}
+
 /// Measures everything.
-pub fn measure(quick: bool, results: &mut BenchResults) {
+pub fn measure(quick: bool, options: &InferenceOptions, results: &mut BenchResults) {
     let folder = TempFolder::new();
     let mut frames = FrameFile::create(folder.path());
-    let models = models(&folder, quick);
+    let nano = root().join("examples/yolo-detector/rust/models/yolox_nano.onnx");
+    let nano = model("YOLOX-nano", DetectorLayout::Yolox, &nano, quick);
+    let others = options.model.iter().map(|path| {
+        // As long as the program.
+        let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned().leak();
+        model(name, DetectorLayout::Ultralytics, path, quick)
+    });
+    let models: Vec<BenchModel> = [nano].into_iter().chain(others).collect();
     if std::env::var_os(LIBRARY).is_none() {
         let skipped = format!("onnxruntime and cuda are skipped, as {LIBRARY} is not set");
         results.notes.push(skipped);
@@ -50,28 +65,15 @@ pub fn measure(quick: bool, results: &mut BenchResults) {
     for model in &models {
         detector(model, &mut frames, results);
     }
-    let [nano, _, large] = &models[..] else { return };
-    clients::memory(large, &mut frames, results);
-    clients::flood(nano, &mut frames, if quick { 20 } else { 200 }, results);
+    models.iter().for_each(|model| clients::memory(model, &mut frames, results));
+    clients::flood(&models[0], &mut frames, if quick { 20 } else { 200 }, results);
 }
 
-fn models(folder: &TempFolder, quick: bool) -> Vec<BenchModel> {
-    let model = |name, layout, path: std::path::PathBuf, frames| {
-        let sha256 = digest(&std::fs::read(&path).expect("the model exists"));
-        BenchModel { name, layout, path, sha256, frames: if quick { 3 } else { frames } }
-    };
-    let shaped = |scale, name: &'static str, frames| {
-        let (file, _) = yolo_shaped(scale);
-        let path = folder.path().join(format!("{name}.onnx"));
-        std::fs::write(&path, &file).expect("the disk has room");
-        model(name, DetectorLayout::Ultralytics, path, frames)
-    };
-    let nano = root().join("examples/yolo-detector/rust/models/yolox_nano.onnx");
-    vec![
-        model("YOLOX-nano", DetectorLayout::Yolox, nano, 200),
-        shaped(GraphScale::N, "YOLO11n-shaped", 100),
-        shaped(GraphScale::M, "YOLO11m-shaped", 40),
-    ]
+fn model(name: &'static str, layout: DetectorLayout, path: &Path, quick: bool) -> BenchModel {
+    let file = std::fs::read(path)
+        .unwrap_or_else(|error| panic!("cannot read the model `{}`: {error}", path.display()));
+    let frames = if quick { 3 } else { FRAMES };
+    BenchModel { name, layout, path: path.to_owned(), sha256: digest(&file), frames }
 }
 
 #[derive(Default)]
@@ -106,7 +108,7 @@ impl DetectorTimes {
         let boxes = ("boxes in a frame".to_owned(), boxes);
         let details = ms.into_iter().chain(memory).chain([boxes]).collect();
         let (name, values) = (program.to_owned(), self.total.clone());
-        Series { name, details, reception: None, values }
+        Series { name, details, values, ..Series::default() }
     }
 }
 
@@ -179,7 +181,7 @@ fn detector(model: &BenchModel, frames: &mut FrameFile, results: &mut BenchResul
         group.series.push(times.series(&name, memory));
     }
     if let Some((python, times)) = &python {
-        group.base = Some(python.runtime.clone());
+        group.bases = vec![python.runtime.clone()];
         group.series.push(times.series(&python.runtime, memory(python.id(), 0.0)));
     }
     results.groups.push(group);

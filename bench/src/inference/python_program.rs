@@ -10,7 +10,7 @@ use serde_json::Value;
 use super::frames::{HEIGHT, WIDTH};
 use super::model_process::BenchModel;
 use super::{MAX_COUNT, MAX_IOU, MIN_SCORE, THREADS};
-use crate::measure::python;
+use gleaner_bench::python;
 
 /// The started program.
 pub(super) struct PythonProgram {

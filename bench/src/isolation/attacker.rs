@@ -12,7 +12,7 @@ use gleaner_tests::{LambdaCopy, TempFolder};
 
 use super::blocks::{BLOCK_MS, BlockSchedule};
 use crate::measure::{Twin, bind_to};
-use gleaner_bench_results::Figure;
+use gleaner_bench::Figure;
 
 pub(super) struct Attack {
     name: &'static str,

@@ -1,6 +1,6 @@
 //! Alternates quiet and attacked blocks of time, and compares them.
 
-use gleaner_bench_results::{Figure, quantile};
+use gleaner_bench::{Figure, quantile};
 
 /// Length of a block.
 pub(super) const BLOCK_MS: i64 = 2500;

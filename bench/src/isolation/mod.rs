@@ -12,7 +12,7 @@ mod start;
 mod victim;
 
 use clap::Args;
-use gleaner_bench_results::{AttackCounts, BenchResults, Figure, Goal, KindValues};
+use gleaner_bench::{BenchResults, Figure};
 use gleaner_dds::{Dds, DdsOptions};
 use gleaner_messages::transport::{Clock, LiveSource};
 use gleaner_tests::live::play;
@@ -49,41 +49,31 @@ impl IsolationOptions {
     }
 }
 
-/// Measures the start of a lambda of each kind; returns its medians in ms.
-pub fn starts(quick: bool, results: &mut BenchResults) -> KindValues {
-    start::figures(if quick { 1 } else { STARTS }, &mut results.figures)
+/// Measures the start of a lambda of each kind.
+pub fn starts(quick: bool, results: &mut BenchResults) {
+    start::figures(if quick { 1 } else { STARTS }, &mut results.figures);
 }
 
-/// Measures everything, and adds what follows from it. Without a second core, nothing is attacked.
+/// Measures everything. Without a second core, nothing is attacked.
 pub fn measure(quick: bool, options: &IsolationOptions, results: &mut BenchResults) {
-    let mut costs = costs::measure(quick, options.seed, results);
-    costs.start_ms = starts(quick, results);
-    if options.has_attacks() {
-        match attacks(quick, &mut results.figures) {
-            // A quick run compares nothing.
-            Ok(counts) => costs.attacks = (counts.compared > 0).then_some(counts),
-            Err(why) => results.notes.push(format!("The attacks are skipped: {why}.")),
-        }
-    }
-    if !quick {
-        results.recommendation = costs.recommendation();
+    costs::measure(quick, options.seed, results);
+    starts(quick, results);
+    if options.has_attacks()
+        && let Err(why) = attacks(quick, &mut results.figures)
+    {
+        results.notes.push(format!("The attacks are skipped: {why}."));
     }
 }
 
 /// Runs all attacks, or returns the reason why they cannot be measured.
-fn attacks(quick: bool, figures: &mut Vec<Figure>) -> Result<AttackCounts, String> {
+fn attacks(quick: bool, figures: &mut Vec<Figure>) -> Result<(), String> {
     let cores = cores().map_err(|error| format!("cannot determine the allowed cores: {error}"))?;
     let [own, attacker, ..] = cores[..] else {
         return Err("victim and attacker need one core each".to_owned());
     };
     bind_to([own]).map_err(|error| format!("cannot bind to one core: {error}"))?;
-    let before = figures.len();
     on_victims(quick, attacker, figures);
-    let compared = figures[before..]
-        .iter()
-        .filter(|figure| figure.unit == "us" && matches!(figure.goal, Some(Goal::AtMost(_))));
-    let unseen = compared.clone().filter(|figure| figure.is_met()).count();
-    Ok(AttackCounts { compared: compared.count(), unseen })
+    Ok(())
 }
 
 /// Runs all attacks on a victim of each kind, with the attacker on `core`.

@@ -8,14 +8,14 @@ use gleaner_tests::drive::{CdrBuilder, IMAGE, one_topic};
 use gleaner_tests::{TempFolder, program, runtime};
 
 use crate::live::lambda;
-use crate::measure::{Twin, median, python};
-use gleaner_bench_results::{Figure, KindValues};
+use crate::measure::Twin;
+use gleaner_bench::{Figure, python};
 
 /// Goals for the lifetime in ms: wasm, and Python without imports of the lambda.
 const GOALS_MS: [(Twin, f64); 2] = [(Twin::Rust, 10.0), (Twin::Python, 150.0)];
 
-/// Adds the figures; returns the medians without a shim.
-pub(super) fn figures(rounds: usize, figures: &mut Vec<Figure>) -> KindValues {
+/// Adds the figures.
+pub(super) fn figures(rounds: usize, figures: &mut Vec<Figure>) {
     let folder = TempFolder::new();
     // Only the header of the type: the lambda reads nothing else.
     let (_, header) = IMAGE.split_once("====").expect("it has a header");
@@ -62,8 +62,6 @@ pub(super) fn figures(rounds: usize, figures: &mut Vec<Figure>) -> KindValues {
         "ms",
         &empty.collect::<Vec<_>>(),
     ));
-    let [wasm, python] = lifetimes.map(|(_, _, [bare, _])| median(&bare));
-    KindValues { native: None, wasm, python }
 }
 
 /// Wraps `runtime`, which has no arguments yet, in its shim.

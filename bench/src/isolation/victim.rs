@@ -14,7 +14,7 @@ use super::blocks::{BlockSchedule, compare};
 use crate::answers::RttReceiver;
 use crate::live::lambda;
 use crate::measure::Twin;
-use gleaner_bench_results::{Figure, quantile};
+use gleaner_bench::{Figure, quantile};
 
 /// Period that a status covers, with the maximum delay until it arrives.
 const STATUS_NS: i64 = 1_050_000_000;

@@ -12,7 +12,7 @@ use bench_kernels::Work;
 use crate::measure::timed;
 use bare::{BareComponent, BareInstance};
 pub use checks::EngineChecks;
-use gleaner_bench_results::Figure;
+use gleaner_bench::Figure;
 
 /// Kernels, with the goal for the ratio of component to native time.
 const KERNELS: [(&str, Option<f64>); 9] = [

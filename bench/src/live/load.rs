@@ -12,7 +12,7 @@ use gleaner_tests::live::{RunningProgram, cpu_ns, descendants, play, run_all};
 use gleaner_tests::{LambdaCopy, TempFolder};
 
 use crate::measure::Twin;
-use gleaner_bench_results::{Figure, quantile};
+use gleaner_bench::{Figure, quantile};
 
 /// Goals for the own memory (USS) of a lambda's process, in MB.
 const OWN_MB: [(Twin, f64); 2] = [(Twin::Rust, 8.0), (Twin::Python, 25.0)];

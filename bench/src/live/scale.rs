@@ -1,7 +1,7 @@
 //! Loads of one and several lambdas, and how their costs grow with a number.
 
 use clap::Args;
-use gleaner_bench_results::{BenchResults, Figure, Growth, GrowthCurve};
+use gleaner_bench::{BenchResults, Figure, Growth, GrowthCurve};
 
 use super::load::{Load, LoadCosts, more_imu};
 use super::packet_loss::PacketLoss;

@@ -8,7 +8,7 @@
 mod inline;
 mod process;
 
-use gleaner_bench_results::{Figure, quantile};
+use gleaner_bench::{Figure, quantile};
 use gleaner_journal::{JournalEntry, JournalHeader};
 use gleaner_lambda::manifest::Store;
 use gleaner_lambda::{Trigger, TriggerKind};

@@ -1,6 +1,6 @@
 //! Cores of the sides, apart from those of the sender and the recorder.
 
-use gleaner_bench_results::CoreList;
+use gleaner_bench::CoreList;
 
 use crate::measure::{bind_to, cores};
 
@@ -69,9 +69,19 @@ impl CoreSplit {
             return start();
         }
         bind(cores).expect("the cores were usable before");
-        let started = start();
-        bind(&self.others).expect("this thread was bound to them before");
-        started
+        let _bound = BoundAgain(&self.others);
+        start()
+    }
+}
+
+/// Binds this thread to its usual cores on drop, also after a side that could not start.
+struct BoundAgain<'a>(&'a CoreList);
+
+impl Drop for BoundAgain<'_> {
+    fn drop(&mut self) {
+        if let Err(why) = bind(self.0) {
+            eprintln!("the sender may share cores with the sides: {why}");
+        }
     }
 }
 

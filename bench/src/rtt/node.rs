@@ -1,18 +1,24 @@
-//! A program that a user would write without Gleaner: a node of `bench/baselines`.
+//! Programs without Gleaner: the nodes of `bench/baselines`, as a user would write them, and those
+//! in Rust of `native`.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::process::Command;
 
+use clap::ValueEnum;
 use gleaner_tests::live::RunningProgram;
 use gleaner_tests::root;
 use serde_json::Value;
 
 use super::ANSWERS;
-use super::workload::Workload;
+use super::workload::{IMU, Workload};
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum NodeKind {
+    /// A reader that only answers.
+    Bare,
+    /// The same reader, with the arithmetic of the workload.
+    Rust,
     /// Cyclone DDS for Python: a stand-in where there is no ROS 2.
     StandIn,
     /// An ordinary ROS 2 node.
@@ -45,6 +51,8 @@ const FACTS: [(&str, &str); 5] = [
 ];
 
 impl NodeSide {
+    /// Name of the reader that only answers.
+    pub(super) const BARE: &'static str = "bare reader";
     /// Name of the stand-in.
     pub(super) const STAND_IN: &'static str = "stand-in (Cyclone DDS for Python)";
     /// Name of the ROS 2 node.
@@ -55,6 +63,8 @@ impl NodeSide {
 
     pub(super) fn name(&self) -> String {
         let name = match self.kind {
+            NodeKind::Bare => Self::BARE,
+            NodeKind::Rust => "native Rust",
             NodeKind::StandIn => Self::STAND_IN,
             NodeKind::Rclpy => Self::RCLPY,
             NodeKind::RclpyKeepingMemory => "rclpy, memory kept",
@@ -74,31 +84,13 @@ impl NodeSide {
         &self,
         workload: Workload,
     ) -> Result<(RunningProgram, BTreeMap<String, String>), String> {
-        let (folder, python) = match self.kind {
-            NodeKind::StandIn => ("cyclonedds_py", root().join("target/baselines/bin/python3")),
-            NodeKind::Rclpy | NodeKind::RclpyKeepingMemory => {
-                let python = std::env::var_os("GLEANER_ROS_PYTHON");
-                ("rclpy", python.map_or_else(|| "python3".into(), PathBuf::from))
+        let started = RunningProgram::start(match self.kind {
+            NodeKind::Bare | NodeKind::Rust => self.native(workload),
+            NodeKind::StandIn | NodeKind::Rclpy | NodeKind::RclpyKeepingMemory => {
+                self.baseline(workload)?
             }
-        };
-        if self.kind == NodeKind::StandIn && !python.is_file() {
-            return Err(format!("there is no {}", python.display()));
-        }
-        let (name, config) = workload.of_baseline();
-        let mut command = Command::new(python);
-        command.arg(root().join("bench/baselines").join(folder).join("node.py")).arg(name);
-        command.args(["--input", "/imu/synthetic", "--answers", ANSWERS]);
-        command.args(["--depth", &self.depth.to_string()]);
-        if workload.is_of_images() {
-            command.args(["--image", workload.event().0]);
-        }
-        command.args(config.iter().flat_map(|value| ["--config", value]));
-        command.env("CYCLONEDDS_URI", self.cyclone());
-        if self.kind == NodeKind::RclpyKeepingMemory {
-            command.envs(KEEPING);
-        }
-        let started = RunningProgram::start(command);
-        let first = started.until_line("the first line of a baseline", |line| {
+        });
+        let first = started.until_line("the first line of a node", |line| {
             serde_json::from_str::<Value>(line).ok()
         });
         if let Some(why) = first["skipped"].as_str() {
@@ -113,6 +105,39 @@ impl NodeSide {
             Some(((*name).to_owned(), value))
         });
         Ok((started, facts.collect()))
+    }
+
+    fn native(&self, workload: Workload) -> Command {
+        let mut command = Command::new(std::env::current_exe().expect("a program has a path"));
+        let workload = workload.to_possible_value().expect("no workload is hidden");
+        command.args(["node", workload.get_name()]);
+        command.args((self.kind == NodeKind::Bare).then_some("--bare"));
+        command
+    }
+
+    fn baseline(&self, workload: Workload) -> Result<Command, String> {
+        let (folder, python) = if self.kind == NodeKind::StandIn {
+            ("cyclonedds_py", root().join("target/baselines/bin/python3"))
+        } else {
+            let python = std::env::var_os("GLEANER_ROS_PYTHON");
+            ("rclpy", python.map_or_else(|| "python3".into(), PathBuf::from))
+        };
+        if self.kind == NodeKind::StandIn && !python.is_file() {
+            return Err(format!("there is no {}", python.display()));
+        }
+        let mut command = Command::new(python);
+        command.arg(root().join("bench/baselines").join(folder).join("node.py"));
+        command.arg(workload.of_baseline()).args(["--input", IMU.0, "--answers", ANSWERS]);
+        command.args(["--depth", &self.depth.to_string()]);
+        if workload.is_of_images() {
+            command.args(["--image", workload.event().0]);
+        }
+        command.args(workload.config().iter().flat_map(|value| ["--config", value]));
+        command.env("CYCLONEDDS_URI", self.cyclone());
+        if self.kind == NodeKind::RclpyKeepingMemory {
+            command.envs(KEEPING);
+        }
+        Ok(command)
     }
 
     /// Returns the configuration of Cyclone DDS: as much socket buffer as the system grants.

@@ -1,19 +1,21 @@
 //! One side of a comparison: it is started, fed for one turn, and ended.
 
 use std::collections::BTreeMap;
+use std::os::unix::fs::symlink;
+use std::process::Command;
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
-use gleaner_bench_results::{Figure, PowerMeter};
+use gleaner_bench::{EnergyMeter, Figure, PartEnergy, Throttling};
+use gleaner_messages::transport::Clock;
 use gleaner_protocol::LiveStatus;
 use gleaner_protocol::inference::InferenceReport;
-use gleaner_tests::live::{PATIENCE, RunningProgram, cpu_ns, descendants, play, run};
-use gleaner_tests::{LambdaCopy, TempFolder};
+use gleaner_tests::live::{PATIENCE, RunningProgram, cpu_ns, descendants, play, run_by};
+use gleaner_tests::{LambdaCopy, TempFolder, program};
 
 use super::ANSWERS;
-use super::bare::BareReader;
 use super::core_split::CoreSplit;
-use super::node::NodeSide;
+use super::node::{NodeKind, NodeSide};
 use super::workload::Workload;
 use crate::answers::{RttAnswer, RttReceiver};
 use crate::measure::{Twin, pss_mib};
@@ -23,167 +25,223 @@ use crate::measure::{Twin, pss_mib};
 const MEMORY_INTERVAL: Duration = Duration::from_secs(4);
 
 pub(super) enum Side {
-    /// A reader that only answers.
-    Bare,
     /// A lambda in `gleaner run`.
-    Lambda(Box<LambdaSide>),
+    Lambda(LambdaSide),
     /// A program without Gleaner.
     Node(NodeSide),
 }
 
 /// A lambda, and its status at the end of the last turn.
 pub(super) struct LambdaSide {
-    /// Name among the lambdas of its workload.
-    pub(super) name: String,
     pub(super) kind: Twin,
-    pub(super) lambda: LambdaCopy,
-    /// True if its topics are received with real-time priority.
-    pub(super) real_time: bool,
-    pub(super) last: Option<LiveStatus>,
+    pub(super) mode: LambdaMode,
+    pub(super) last: Option<Box<LiveStatus>>,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(super) enum LambdaMode {
+    Usual,
+    /// The lambda computes by kernels of the SDK what the host does otherwise.
+    Kernel,
+    /// Its topics are received with real-time priority.
+    RealTime,
+    /// The component has neither fuel nor epochs.
+    Unchecked,
+}
+
+/// The conditions of all turns of a comparison.
+pub(super) struct TurnConditions<'a> {
+    pub(super) workload: Workload,
+    pub(super) answers: &'a RttReceiver,
+    pub(super) split: &'a CoreSplit,
+    pub(super) meter: &'a EnergyMeter,
+    /// Energy while nothing ran.
+    pub(super) idle: &'a [PartEnergy],
+    /// Lengths of the warm-up and of the measured time.
+    pub(super) seconds: [u32; 2],
 }
 
 /// The measurements of one turn.
 pub(super) struct Turn {
-    /// Round trips after the warm-up, in the order of their answers.
-    pub(super) times_ms: Vec<f64>,
-    /// Samples that were sent and answered, with those of the warm-up.
+    /// All answers, in the order of their arrival.
+    pub(super) answers: Vec<RttAnswer>,
+    /// Stamp of the first sample after the warm-up.
+    from_ns: i64,
+    /// Samples that were sent, with those of the warm-up.
     pub(super) sent: u64,
-    pub(super) answered: u64,
-    /// Costs of all processes of the side; `None` for a part of the bench itself.
-    pub(super) cpu_percent: Option<f64>,
-    pub(super) memory_mb: Option<f64>,
+    /// Costs by name and unit, of all processes of the side and of the machine.
+    pub(super) costs: Vec<(String, f64)>,
     /// Memory over the measured time: seconds, and MB.
     pub(super) memory: Vec<[f64; 2]>,
-    /// Power of the whole machine: what was measured, and W.
-    pub(super) power_w: Vec<(String, f64)>,
     /// Facts about the side.
     pub(super) facts: BTreeMap<String, String>,
+    /// Reasons why the turn is invalid.
+    pub(super) invalid: Vec<String>,
 }
 
-enum RunningSide {
-    Bare(BareReader),
-    Lambda(RunningProgram, TempFolder),
-    Node(RunningProgram),
+struct RunningSide {
+    started: RunningProgram,
+    is_lambda: bool,
+    /// Of a lambda, for as long as it runs.
+    _files: Option<(LambdaCopy, TempFolder)>,
+}
+
+impl Turn {
+    /// Returns the answers to samples after the warm-up.
+    pub(super) fn counted(&self) -> impl Iterator<Item = &RttAnswer> {
+        self.answers.iter().filter(|answer| answer.stamp_ns() >= self.from_ns)
+    }
+}
+
+impl LambdaSide {
+    fn name(&self) -> String {
+        match self.mode {
+            LambdaMode::Usual => self.kind.to_string(),
+            LambdaMode::Kernel => format!("{}, SDK kernel", self.kind),
+            LambdaMode::RealTime => format!("{}, in real time", self.kind),
+            LambdaMode::Unchecked => format!("{} without checks", self.kind),
+        }
+    }
+
+    fn start(&self, workload: Workload) -> Result<RunningSide, String> {
+        let copy = match self.mode {
+            LambdaMode::Kernel => Workload::kernel_lambda(),
+            _ => workload.lambda(self.kind),
+        };
+        let (folder, mut gleaner) = (TempFolder::new(), Command::new(program("gleaner")));
+        if self.mode == LambdaMode::Unchecked {
+            // This program acts as the runtime under its name; see `main`.
+            let this = std::env::current_exe().expect("a program has a path");
+            symlink(this, folder.path().join("gleaner-runtime")).expect("the folder is new");
+            gleaner.env("GLEANER_HOME", folder.path());
+        }
+        let mut args = vec!["--no-record", "--rtt", ANSWERS];
+        args.extend(workload.config().iter().flat_map(|value| ["--set", value]));
+        args.extend((self.mode == LambdaMode::RealTime).then_some("--real-time"));
+        let started = run_by(gleaner, &[copy.path()], &folder.path().join("out"), &args);
+        started.until_ready();
+        if self.mode == LambdaMode::RealTime {
+            let has_network = |live: &LiveStatus| live.network.buffer_granted > 0;
+            let live = started.until_live("a status of the network", has_network);
+            if !live.network.real_time {
+                return Err("real-time priority is not permitted here".to_owned());
+            }
+        }
+        Ok(RunningSide { started, is_lambda: true, _files: Some((copy, folder)) })
+    }
 }
 
 impl Side {
-    /// Name of the bare reader.
-    pub(super) const BARE: &'static str = "bare reader";
-
     pub(super) fn name(&self) -> String {
         match self {
-            Self::Bare => Self::BARE.to_owned(),
-            Self::Lambda(side) => format!("lambda, {}", side.name),
+            Self::Lambda(side) => format!("lambda, {}", side.name()),
             Self::Node(side) => side.name(),
         }
     }
 
-    /// Runs one turn; `seconds` are those of the warm-up and of the measured time.
+    /// Returns whether it only answers.
+    pub(super) fn is_bare(&self) -> bool {
+        matches!(self, Self::Node(NodeSide { kind: NodeKind::Bare, .. }))
+    }
+
+    fn is_unchecked(&self) -> bool {
+        matches!(self, Self::Lambda(LambdaSide { mode: LambdaMode::Unchecked, .. }))
+    }
+
+    /// Runs one turn.
     ///
     /// # Errors
     ///
     /// The reason why it cannot run here.
-    pub(super) fn turn(
-        &mut self,
-        workload: Workload,
-        answers: &RttReceiver,
-        (split, meter): (&CoreSplit, &PowerMeter),
-        [warm_up, measured]: [u32; 2],
-    ) -> Result<Turn, String> {
+    ///
+    /// # Panics
+    ///
+    /// With its standard error, if it fails.
+    pub(super) fn turn(&mut self, conditions: &TurnConditions<'_>) -> Result<Turn, String> {
+        let &TurnConditions { workload, answers, split, seconds, .. } = conditions;
+        let [warm_up, measured] = seconds;
+        let before = Throttling::now();
         let (running, mut facts) = split.for_side(|| self.start(workload))?;
         answers.take();
-        let player = workload.player(matches!(self, Self::Bare), warm_up + measured);
+        let player = workload.player(self.is_bare(), warm_up + measured);
         let mut arguments = vec!["--stamp", "monotonic", "--wait", "1"];
         arguments.extend(player.iter().map(String::as_str));
         let player = play(&arguments);
-        let mut received = first(answers, &self.name());
+        let mut received = running.first(answers);
         sleep(Duration::from_secs(warm_up.into()));
-        let (before, began) = (running.cpu_ns(), Instant::now());
+        let (clock, cpu_before) = (Clock::new(0), running.cpu_ns());
+        let began_ns = clock.now();
         let mut memory: Vec<[f64; 2]> = Vec::new();
         let measured = Duration::from_secs_f64(0.9 * f64::from(measured));
-        let power_w = meter.watch(measured, |elapsed| {
+        let energy = conditions.meter.watch(measured, |elapsed| {
             let due = MEMORY_INTERVAL * memory.len() as u32;
-            if elapsed >= due {
-                memory.extend(running.memory_mb().map(|mb| [due.as_secs_f64(), mb]));
+            // Without checks, the process also has the compiler of its component.
+            if elapsed >= due && !self.is_unchecked() {
+                memory.push([due.as_secs_f64(), running.memory_mb()]);
             }
         });
-        let cpu = running.cpu_ns().zip(before).map(|(after, before)| after.saturating_sub(before));
-        let span = began.elapsed();
-        let memory_mb = memory.last().map(|[_, mb]| *mb);
+        let (cpu_ns, ended_ns) = (running.cpu_ns().saturating_sub(cpu_before), clock.now());
+        let after = Throttling::now();
         if workload.is_looped() {
             player.signal("INT");
         }
-        let played = player.finish();
-        let sent = played.sent()[workload.event().0];
+        let sent = player.finish().sent()[workload.event().0];
         // The last answers may still be on their way.
         sleep(Duration::from_millis(500));
         received.extend(answers.take());
         self.end(running, &mut facts);
-        let stamp = |answer: &RttAnswer| answer.at_ns - answer.ns as i64;
-        let from = stamp(&received[0]) + i64::from(warm_up) * 1_000_000_000;
-        let counted = received.iter().filter(|answer| stamp(answer) >= from);
+        let in_span = received.iter().filter(|it| (began_ns..ended_ns).contains(&it.arrived_ns));
+        let (span_s, wakes) = ((ended_ns - began_ns) as f64 / 1e9, in_span.count());
+        let cpu = ("CPU, % of a core".to_owned(), cpu_ns as f64 / 1e7 / span_s);
+        let mut costs = vec![cpu];
+        for (name, value) in [
+            ("memory (PSS), MB", memory.last().map(|[_, mb]| *mb)),
+            ("temperature, °C", after.temperature),
+            ("clock, MHz", after.clock_mhz),
+        ] {
+            costs.extend(value.map(|value| (name.to_owned(), value)));
+        }
+        costs.extend(energy.iter().flat_map(|part| power(part, conditions.idle, span_s, wakes)));
         Ok(Turn {
-            times_ms: counted.map(|answer| answer.ns / 1e6).collect(),
+            from_ns: received[0].stamp_ns() + i64::from(warm_up) * 1_000_000_000,
+            answers: received,
             sent,
-            answered: received.len() as u64,
-            cpu_percent: cpu.map(|cpu| 100.0 * cpu as f64 / span.as_nanos() as f64),
-            memory_mb,
+            costs,
             memory,
-            power_w,
             facts,
+            invalid: after.since(&before),
         })
     }
 
     fn start(&self, workload: Workload) -> Result<(RunningSide, BTreeMap<String, String>), String> {
-        let (topic, type_name) = workload.event();
-        let fact = |name: &str, value: &str| (name.to_owned(), value.to_owned());
         match self {
-            Self::Bare => {
-                let reader = BareReader::start(topic, type_name, ANSWERS);
-                Ok((RunningSide::Bare(reader), [fact("stack", "RustDDS, in one thread")].into()))
-            }
             Self::Lambda(side) => {
-                let out = TempFolder::new();
-                let mut args = vec!["--no-record", "--rtt", ANSWERS];
-                args.extend(side.real_time.then_some("--real-time"));
-                let started = run(side.lambda.path(), out.path(), &args);
-                started.until_ready();
-                if side.real_time {
-                    let has_network = |live: &LiveStatus| live.network.buffer_granted > 0;
-                    let live = started.until_live("a status of the network", has_network);
-                    if !live.network.real_time {
-                        return Err("real-time priority is not permitted here".to_owned());
-                    }
-                }
+                let fact = |name: &str, value: &str| (name.to_owned(), value.to_owned());
                 let stack = fact("stack", "RustDDS, in gleaner-ingress");
-                Ok((RunningSide::Lambda(started, out), [stack].into()))
+                let memory = fact("memory", "not measured: the process has the compiler in it");
+                let facts = [stack].into_iter().chain(self.is_unchecked().then_some(memory));
+                Ok((side.start(workload)?, facts.collect()))
             }
             Self::Node(side) => {
                 let (started, facts) = side.start(workload)?;
-                Ok((RunningSide::Node(started), facts))
+                Ok((RunningSide { started, is_lambda: false, _files: None }, facts))
             }
         }
     }
 
     /// Ends a side, and adds what it states at its end.
     fn end(&mut self, running: RunningSide, facts: &mut BTreeMap<String, String>) {
-        match running {
-            RunningSide::Bare(reader) => reader.stop(),
-            RunningSide::Lambda(started, _out) => {
-                let finished = started.interrupt();
+        let finished = running.started.interrupt();
+        match self {
+            Self::Lambda(side) => {
                 let runtime = finished.lines.iter().find_map(|line| model_runtime(line));
                 facts.extend(runtime.map(|runtime| ("model".to_owned(), runtime)));
                 let live = finished.ended();
                 let granted = live.network.buffer_granted;
                 facts.insert("socket buffer, B".to_owned(), granted.to_string());
-                if let Self::Lambda(side) = self {
-                    side.last = Some(live);
-                }
+                side.last = Some(Box::new(live));
             }
-            RunningSide::Node(started) => {
-                let finished = started.interrupt();
-                assert!(finished.status.success(), "{}", finished.stderr);
-            }
+            Self::Node(_) => assert!(finished.status.success(), "{}", finished.stderr),
         }
     }
 
@@ -196,18 +254,19 @@ impl Side {
             Twin::Rust => [20.0, 100.0],
             Twin::Python => [30.0, 150.0],
         };
+        let has_goals = !workload.is_of_images() && !self.is_unchecked();
         for (what, stats, has_goal) in [
-            ("sample received to lambda entered", live.wake_latency, true),
+            ("sample received to lambda entered", live.wake_latency, has_goals),
             ("in the lambda", live.run_time, false),
-            ("lambda returned to decision sent", live.decision_latency, true),
+            ("lambda returned to decision sent", live.decision_latency, has_goals),
         ] {
             let Some(stats) = stats else { continue };
             for (share, ns, goal) in
                 [("p50", stats.p50_ns, goals[0]), ("p99", stats.p99_ns, goals[1])]
             {
-                let name = format!("{group}, {}: {what}, {share}", side.name);
+                let name = format!("{group}, {}: {what}, {share}", side.name());
                 let us = [ns as f64 / 1e3];
-                figures.push(if has_goal && !workload.is_of_images() {
+                figures.push(if has_goal {
                     Figure::at_most(&name, "us", goal, &us)
                 } else {
                     Figure::without_goal(&name, "us", &us)
@@ -218,28 +277,52 @@ impl Side {
 }
 
 impl RunningSide {
-    /// Returns the processes of the side; none for a part of the bench itself.
-    fn processes(&self) -> Vec<u32> {
-        match self {
-            Self::Bare(_) => Vec::new(),
-            Self::Lambda(started, _) => {
-                // The command itself only waits, and prints the status once a second.
-                descendants(started.pid(), "")
+    /// Waits for the first answers.
+    fn first(&self, answers: &RttReceiver) -> Vec<RttAnswer> {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            let received = answers.take();
+            if !received.is_empty() {
+                return received;
             }
-            Self::Node(started) => vec![started.pid()],
+            let is_late = Instant::now() > deadline;
+            assert!(!is_late, "no answer arrives; stderr:\n{}", self.started.stderr());
+            sleep(Duration::from_millis(20));
         }
     }
 
-    fn cpu_ns(&self) -> Option<u64> {
-        let processes = self.processes();
-        (!processes.is_empty()).then(|| processes.into_iter().map(cpu_ns).sum())
+    fn processes(&self) -> Vec<u32> {
+        if self.is_lambda {
+            // The command itself only waits, and prints the status once a second.
+            descendants(self.started.pid(), "")
+        } else {
+            vec![self.started.pid()]
+        }
     }
 
-    fn memory_mb(&self) -> Option<f64> {
-        let processes = self.processes();
-        let mib = (!processes.is_empty()).then(|| processes.into_iter().map(pss_mib).sum::<f64>());
-        mib.filter(|mib| mib.is_finite()).map(|mib| mib * f64::from(1 << 20) / 1e6)
+    fn cpu_ns(&self) -> u64 {
+        self.processes().into_iter().map(cpu_ns).sum()
     }
+
+    /// NaN if it is unknown.
+    fn memory_mb(&self) -> f64 {
+        let mib = self.processes().into_iter().map(pss_mib).sum::<f64>();
+        mib * f64::from(1 << 20) / 1e6
+    }
+}
+
+/// Returns the power of a part of the machine and, where it was measured while nothing ran, what is
+/// above that. A side made `wakes` answers in `span_s` seconds.
+fn power(part: &PartEnergy, idle: &[PartEnergy], span_s: f64, wakes: usize) -> Vec<(String, f64)> {
+    let PartEnergy { part: name, watts, .. } = part;
+    let mut costs = vec![(format!("power, {name}, W"), *watts)];
+    if let Some(idle) = idle.iter().find(|idle| idle.part == *name) {
+        let above = watts - idle.watts;
+        costs.push((format!("power above idle, {name}, W"), above));
+        let per_wake = 1e3 * above * span_s / wakes as f64;
+        costs.push((format!("energy per wake above idle, {name}, mJ"), per_wake));
+    }
+    costs
 }
 
 /// Returns what ran the model of a lambda, if a line is the last report of its process.
@@ -247,18 +330,5 @@ fn model_runtime(line: &str) -> Option<String> {
     match serde_json::from_str(line) {
         Ok(InferenceReport::Ended(status)) => Some(status.models.first()?.runtime.clone()),
         _ => None,
-    }
-}
-
-/// Waits for the first answers of a side.
-fn first(answers: &RttReceiver, side: &str) -> Vec<RttAnswer> {
-    let deadline = Instant::now() + PATIENCE;
-    loop {
-        let received = answers.take();
-        if !received.is_empty() {
-            return received;
-        }
-        assert!(Instant::now() < deadline, "{side}: no answer arrives");
-        sleep(Duration::from_millis(20));
     }
 }

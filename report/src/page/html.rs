@@ -13,14 +13,8 @@ const STYLE: [&str; 2] =
     [include_str!("../../assets/uPlot.min.css"), include_str!("../../assets/page/page.css")];
 const PLOTS: &str = include_str!("../../assets/uPlot.iife.min.js");
 const PLOTS_LICENSE: &str = include_str!("../../assets/uPlot.LICENSE");
-pub(crate) const MEASUREMENT_SCRIPTS: &[&str] = &[
-    include_str!("../../assets/page/elements.js"),
-    include_str!("../../assets/page/format.js"),
-    include_str!("../../assets/page/colours.js"),
-    include_str!("../../assets/page/measurements.js"),
-];
-/// The scripts of the report of a run, each after those that it uses.
-pub(super) const RUN_SCRIPTS: &[&str] = &[
+/// The scripts of the page, each after those that it uses.
+const SCRIPTS: &[&str] = &[
     include_str!("../../assets/page/elements.js"),
     include_str!("../../assets/page/format.js"),
     include_str!("../../assets/page/colours.js"),
@@ -36,8 +30,8 @@ pub(super) const RUN_SCRIPTS: &[&str] = &[
     include_str!("../../assets/page/main.js"),
 ];
 
-pub(crate) fn html(page: &impl Serialize, scripts: &[&str]) -> String {
-    let script = script(scripts);
+pub(super) fn html(page: &impl Serialize) -> String {
+    let script = script();
     let policy = format!(
         "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{}'; base-uri 'none'; form-action 'none'",
         STANDARD.encode(Sha256::digest(&script))
@@ -62,8 +56,8 @@ pub(crate) fn html(page: &impl Serialize, scripts: &[&str]) -> String {
 }
 
 /// Returns the script as one function, so that it adds no global names.
-fn script(scripts: &[&str]) -> String {
-    format!("\n{PLOTS}\n(() => {{\n\"use strict\";\n{}\n}})();\n", scripts.join("\n"))
+fn script() -> String {
+    format!("\n{PLOTS}\n(() => {{\n\"use strict\";\n{}\n}})();\n", SCRIPTS.join("\n"))
 }
 
 /// Returns `value` as JSON without characters that could end an HTML element or a line of a script.
@@ -100,16 +94,10 @@ mod tests {
 
     #[test]
     fn the_hash_is_that_of_the_script_in_its_element() {
-        for scripts in [RUN_SCRIPTS, MEASUREMENT_SCRIPTS] {
-            check_hash(scripts);
-        }
-    }
-
-    fn check_hash(scripts: &[&str]) {
-        let page = html(&"", scripts);
+        let page = html(&"");
         let (_, after) = page.split_once("<script>").unwrap();
         let (inside, rest) = after.split_once("</script>").unwrap();
-        assert_eq!(inside, script(scripts));
+        assert_eq!(inside, script());
         // An HTML comment in a script would change where it ends.
         assert!(!inside.contains("<!--") && !inside.contains('\r'));
         assert!(!rest.contains("<script"));
@@ -119,12 +107,7 @@ mod tests {
 
     #[test]
     fn the_page_fetches_nothing_and_sets_no_text_as_html() {
-        let sources = [PAGE, STYLE[1]]
-            .iter()
-            .chain(RUN_SCRIPTS)
-            .chain(MEASUREMENT_SCRIPTS)
-            .copied()
-            .collect::<String>();
+        let sources = [PAGE, STYLE[1]].iter().chain(SCRIPTS).copied().collect::<String>();
         for word in [
             "http://",
             "https://",

@@ -21,8 +21,7 @@ use crate::diff::Diff;
 use crate::format::seconds;
 use crate::run_summary::OutputError;
 
-use html::RUN_SCRIPTS;
-pub(crate) use html::{MEASUREMENT_SCRIPTS, html};
+use html::html;
 use model::PageRun;
 
 /// The data of a page about one run, or about two that are compared.
@@ -64,7 +63,7 @@ impl ReportPage {
     /// Renders the page as one file in UTF-8, of at most a few MiB. It loads nothing, and runs no
     /// script but its own, whatever the results contain.
     pub fn to_html(&self) -> String {
-        html(self, RUN_SCRIPTS)
+        html(self)
     }
 
     fn new(runs: Vec<PageRun>, diff: Option<Diff>) -> ReportPage {

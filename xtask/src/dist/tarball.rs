@@ -27,8 +27,14 @@ pub(super) const TARBALL: PackageSource = PackageSource {
 };
 
 /// Folders of the checkout whose files are in it, at the same places, with the builds of lambdas.
-const FOLDERS: [&str; 5] =
-    ["bench/baselines", "bench/lambdas", "examples", "tests/lambdas/attack", "wit"];
+const FOLDERS: [&str; 6] = [
+    "bench/analysis",
+    "bench/baselines",
+    "bench/lambdas",
+    "examples",
+    "tests/lambdas/attack",
+    "wit",
+];
 const FILES: [&str; 1] = ["bench/rosbags_loop.py"];
 
 /// Creates it in `out`, and returns its path. `work` is a folder for its tree.

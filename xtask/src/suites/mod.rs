@@ -246,7 +246,7 @@ fn suites(checkout: &Checkout) -> Vec<Suite> {
         pytest(checkout, "Python SDK", &["guest-sdk-python/tests"]),
         pytest(checkout, "fleet client", &["fleet-client-python/tests"]),
         // As users test lambdas, with the SDK of this checkout.
-        pytest(checkout, "examples, notebooks and baselines", &["examples", "bench/baselines"]),
+        pytest(checkout, "examples, notebooks and baselines", &["examples", "bench/baselines", "bench/analysis"]),
     ]);
     suites.extend(typed(checkout).into_iter().map(|file| {
         let mut mypy = checkout.command(checkout.python());
@@ -304,6 +304,7 @@ fn typed(checkout: &Checkout) -> Vec<PathBuf> {
         "guest-sdk-python/tests",
         "fleet-client-python/gleaner_fleet",
         "fleet-client-python/tests",
+        "bench/analysis",
     ];
     packages.map(PathBuf::from).into_iter().chain(mains).collect()
 }

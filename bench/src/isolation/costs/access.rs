@@ -5,14 +5,12 @@
 use std::collections::BTreeMap;
 use std::hint::black_box;
 
-use gleaner_bench_results::{
-    BenchResults, Figure, IsolationCosts, KindValues, Series, SeriesGroup,
-};
+use gleaner_bench::{BenchResults, Figure, Series, SeriesGroup};
 use gleaner_tests::{TempFolder, replay, root};
 
 use super::drives::{self, FRAME_BYTES};
 use super::hosted::{COLUMN, FilledInputs, HostedKernel};
-use crate::measure::{median, shuffled, timed};
+use crate::measure::{shuffled, timed};
 
 /// Name of the row of a copy without Gleaner.
 const MEMCPY: &str = "memcpy";
@@ -25,21 +23,10 @@ const PYTHON: usize = 2;
 /// Measured times by the name of their row.
 type Times = BTreeMap<&'static str, Vec<f64>>;
 
-pub(super) fn measure(
-    quick: bool,
-    seed: u64,
-    results: &mut BenchResults,
-    costs: &mut IsolationCosts,
-) {
+pub(super) fn measure(quick: bool, seed: u64, results: &mut BenchResults) {
     eprintln!("host calls, columns and frames");
     let (blocks, rounds) = if quick { (1, 1) } else { (5, 6) };
     let [native, wasm, python] = measured(blocks, rounds, &mut seed.max(1));
-    let median = |times: &Times, name| times.get(name).and_then(|times| median(times));
-    costs.host_call_ns = KindValues {
-        native: median(&native, "call"),
-        wasm: median(&wasm, "call"),
-        python: median(&python, "call"),
-    };
     let of_kinds =
         |name| [("native", &native, name), ("wasm", &wasm, name), ("Python", &python, name)];
     results.groups.push(group("A host call, now-ns", ("ns", 1.0), "native", &of_kinds("call")));
@@ -86,7 +73,7 @@ fn group(
     SeriesGroup {
         name: name.to_owned(),
         unit: unit.to_owned(),
-        base: Some(base.to_owned()),
+        bases: vec![base.to_owned()],
         series: series.collect(),
     }
 }

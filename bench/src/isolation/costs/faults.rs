@@ -3,29 +3,26 @@
 
 use std::path::Path;
 
-use gleaner_bench_results::{BenchResults, IsolationCosts, KindValues, Series, SeriesGroup};
+use gleaner_bench::{BenchResults, Series, SeriesGroup};
 use gleaner_lambda::{Decision, FaultKind};
 use gleaner_tests::live::{decisions, run_all};
 use gleaner_tests::{LambdaCopy, TempFolder, replay, sample_drive};
 
 use super::live::until_all;
-use crate::measure::{Twin, median};
-
-const TRAP: &str = "wasm: trap";
-const EXCEPTION: &str = "Python: exception";
+use crate::measure::Twin;
 
 /// A fault in a replay: its row, the kind of lambda, the attack, and the expected fault.
 const REPLAYED: [(&str, Twin, &str, FaultKind); 3] = [
-    (TRAP, Twin::Rust, "abort", FaultKind::Trap),
+    ("wasm: trap", Twin::Rust, "abort", FaultKind::Trap),
     ("wasm: 5,000,000 units of fuel", Twin::Rust, "endless", FaultKind::Fuel),
     // There is no such attack.
-    (EXCEPTION, Twin::Python, "no_such_attack", FaultKind::Exception),
+    ("Python: exception", Twin::Python, "no_such_attack", FaultKind::Exception),
 ];
 /// Faults by a deadline.
 const LIVE: [(&str, Twin); 2] =
     [("wasm: deadline of 20 ms", Twin::Rust), ("Python: deadline of 20 ms", Twin::Python)];
 
-pub(super) fn measure(quick: bool, results: &mut BenchResults, costs: &mut IsolationCosts) {
+pub(super) fn measure(quick: bool, results: &mut BenchResults) {
     eprintln!("faults");
     let mut measured: Vec<_> = REPLAYED
         .into_iter()
@@ -52,11 +49,6 @@ pub(super) fn measure(quick: bool, results: &mut BenchResults, costs: &mut Isola
         faulted.push(series(0));
         next.push(series(1));
     }
-    let median = |row: &str| {
-        let found = next.iter().find(|series| series.name == row);
-        found.and_then(|series| median(&series.values))
-    };
-    costs.restarted_ms = KindValues { native: None, wasm: median(TRAP), python: median(EXCEPTION) };
     for (name, series) in [
         ("A wake that ends in a fault", faulted),
         ("The wake after a fault, which starts the lambda again", next),
@@ -64,7 +56,7 @@ pub(super) fn measure(quick: bool, results: &mut BenchResults, costs: &mut Isola
         results.groups.push(SeriesGroup {
             name: name.to_owned(),
             unit: "ms".to_owned(),
-            base: None,
+            bases: Vec::new(),
             series,
         });
     }

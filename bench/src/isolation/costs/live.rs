@@ -4,9 +4,7 @@
 use std::path::Path;
 use std::time::Instant;
 
-use gleaner_bench_results::{
-    BenchResults, Growth, GrowthCurve, IsolationCosts, KindValues, Series, SeriesGroup,
-};
+use gleaner_bench::{BenchResults, Growth, GrowthCurve, Series, SeriesGroup, median};
 use gleaner_protocol::{LiveStatus, Report};
 use gleaner_tests::live::{RunningProgram, run_all};
 use gleaner_tests::{LambdaCopy, TempFolder, sample_drive};
@@ -14,7 +12,7 @@ use rustix::process::{Pid, Signal, kill_process};
 
 use super::drives::{self, CAMERA, IMU};
 use crate::live::LiveProcesses;
-use crate::measure::{Twin, median, pss_mib};
+use crate::measure::{Twin, pss_mib};
 use crate::rtt::Workload;
 
 const KINDS: [Twin; 2] = [Twin::Rust, Twin::Python];
@@ -37,7 +35,7 @@ struct LiveKind {
     memory: Vec<(usize, f64)>,
 }
 
-pub(super) fn measure(quick: bool, results: &mut BenchResults, costs: &mut IsolationCosts) {
+pub(super) fn measure(quick: bool, results: &mut BenchResults) {
     eprintln!("live processes");
     let (rounds, counts, length): (_, &[usize], _) = match quick {
         true => (1, &[1], LiveLength { warm_up: 1, statuses: 2 }),
@@ -62,8 +60,6 @@ pub(super) fn measure(quick: bool, results: &mut BenchResults, costs: &mut Isola
         if kinds.iter().all(|live| !of(live).is_empty()) {
             let title = format!("{name}: CPU of the lambda's process per wake");
             results.groups.push(group(&title, "us", &kinds, of));
-            let medians = values(&kinds, |live| median(of(live)));
-            costs.live_cpu_us.push((name.to_owned(), medians));
         }
     }
     results.groups.push(group(
@@ -87,18 +83,6 @@ pub(super) fn measure(quick: bool, results: &mut BenchResults, costs: &mut Isola
         unit: "MB".to_owned(),
         curves: KINDS.into_iter().zip(&kinds).map(curve).collect(),
     });
-    costs.first_lambda_mb = values(&kinds, |live| Some(live.memory_of(1)));
-    costs.further_lambda_mb = values(&kinds, |live| {
-        let [first, .., last] = counts else { return None };
-        let grown = live.memory_of(*last) - live.memory_of(*first);
-        Some(grown / (last - first) as f64)
-    });
-    costs.killed_s = values(&kinds, |live| median(&live.killed_s));
-}
-
-fn values([wasm, python]: &[LiveKind; 2], of: impl Fn(&LiveKind) -> Option<f64>) -> KindValues {
-    let measured = |live| of(live).filter(|value| value.is_finite());
-    KindValues { native: None, wasm: measured(wasm), python: measured(python) }
 }
 
 fn group(
@@ -115,7 +99,7 @@ fn group(
     SeriesGroup {
         name: name.to_owned(),
         unit: unit.to_owned(),
-        base: Some(Twin::Rust.to_string()),
+        bases: vec![Twin::Rust.to_string()],
         series: series.collect(),
     }
 }

@@ -14,17 +14,16 @@ mod native;
 mod sides;
 mod wakes;
 
-use gleaner_bench_results::{BenchResults, IsolationCosts};
+use gleaner_bench::BenchResults;
 
 pub use sides::{BenchGuest, run_as_runtime};
 
 /// Measures all costs; the sides take turns in an order by `seed`.
-pub(super) fn measure(quick: bool, seed: u64, results: &mut BenchResults) -> IsolationCosts {
-    let mut costs = IsolationCosts::default();
-    wakes::measure(quick, seed, results, &mut costs);
-    access::measure(quick, seed, results, &mut costs);
-    live::measure(quick, results, &mut costs);
-    faults::measure(quick, results, &mut costs);
+pub(super) fn measure(quick: bool, seed: u64, results: &mut BenchResults) {
+    wakes::measure(quick, seed, results);
+    access::measure(quick, seed, results);
+    live::measure(quick, results);
+    faults::measure(quick, results);
     results.notes.extend([
         format!(
             "*Time per wake* is `run_ns` of the decision, in a replay; the sides take turns, in an \
@@ -44,5 +43,4 @@ pub(super) fn measure(quick: bool, seed: u64, results: &mut BenchResults) -> Iso
          between wakes."
             .to_owned(),
     ]);
-    costs
 }

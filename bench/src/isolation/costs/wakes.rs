@@ -3,9 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use gleaner_bench_results::{
-    BenchResults, IsolationCosts, KindValues, MeasuredDifference, Series, SeriesGroup, WakeCosts,
-};
+use gleaner_bench::{BenchResults, Series, SeriesGroup};
 use gleaner_lambda::{Decision, twins_differ};
 use gleaner_tests::drive::{TopicMessages, of_topics};
 use gleaner_tests::{LambdaCopy, TempFolder};
@@ -13,7 +11,7 @@ use imu_fft::road::Road;
 
 use super::drives::{self, CAMERA, IMU};
 use super::sides::{WakeSide, WakeTurn};
-use crate::measure::{Twin, median, shuffled};
+use crate::measure::{Twin, shuffled};
 use crate::rtt::Workload;
 
 /// Wakes without a spectrum that are kept of a turn: all of them would be most of the results.
@@ -41,19 +39,12 @@ struct RecordedWorkload {
 struct SideValues {
     /// Times of wakes by their kind, in us.
     wakes: Vec<Vec<f64>>,
-    /// Their median in each turn.
-    medians: Vec<Vec<f64>>,
     /// CPU time per wake of each turn, in us.
     cpu: Vec<f64>,
 }
 
-/// Measures all workloads, in an order by `seed`, and adds the costs of their wakes to `costs`.
-pub(super) fn measure(
-    quick: bool,
-    seed: u64,
-    results: &mut BenchResults,
-    costs: &mut IsolationCosts,
-) {
+/// Measures all workloads, in an order by `seed`.
+pub(super) fn measure(quick: bool, seed: u64, results: &mut BenchResults) {
     let mut random = seed.max(1);
     let turns = if quick { 1 } else { 15 };
     let mut cpu = Vec::new();
@@ -63,11 +54,6 @@ pub(super) fn measure(
         for (index, kind) in workload.kinds.iter().enumerate() {
             let name = format!("{}, {kind}: time per wake", workload.name);
             let group = group(name, workload.sides, &values, |side| &side.wakes[index]);
-            let medians = |of: WakeSide| {
-                let place = workload.sides.iter().position(|side| *side == of);
-                place.map(|place| &values[place].medians[index][..])
-            };
-            costs.wakes.push(costs_of(&format!("{}, {kind}", workload.name), medians));
             results.groups.push(group);
         }
         if workload.has_cpu {
@@ -92,26 +78,8 @@ fn group(
     SeriesGroup {
         name,
         unit: "us".to_owned(),
-        base: Some(WakeSide::NATIVE.name().to_owned()),
+        bases: vec![WakeSide::NATIVE.name().to_owned()],
         series: series.filter(|series| !series.values.is_empty()).collect(),
-    }
-}
-
-/// Takes the medians of turns, and compares a component with one without checks by them: the
-/// speed of the machine differs between turns more than within one.
-fn costs_of<'a>(name: &str, of_turns: impl Fn(WakeSide) -> Option<&'a [f64]>) -> WakeCosts {
-    let median = |side: WakeSide| of_turns(side).and_then(median);
-    let checks = of_turns(WakeSide::UNCHECKED)
-        .zip(of_turns(WakeSide::WASM))
-        .and_then(|(unchecked, wasm)| MeasuredDifference::between(unchecked, wasm));
-    WakeCosts {
-        name: name.to_owned(),
-        us: KindValues {
-            native: median(WakeSide::NATIVE),
-            wasm: median(WakeSide::WASM),
-            python: median(WakeSide::PYTHON),
-        },
-        checks,
     }
 }
 
@@ -192,9 +160,7 @@ impl SideValues {
             wakes[kind].push(decision.run_ns as f64 / 1e3);
         }
         self.wakes.resize(wakes.len(), Vec::new());
-        self.medians.resize(wakes.len(), Vec::new());
         for (kind, wakes) in wakes.iter().enumerate() {
-            self.medians[kind].extend(median(wakes));
             let kept = if kind == 0 { wakes.len() } else { OTHER_WAKES.min(wakes.len()) };
             self.wakes[kind].extend(&wakes[..kept]);
         }

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::Duration;
 
-use gleaner_bench_results::{Figure, quantile};
+use gleaner_bench::{Figure, quantile};
 use gleaner_fleet::people::{FleetDeployment, ListPage};
 use hyper::Method;
 use tokio::time::{Instant, sleep, timeout};

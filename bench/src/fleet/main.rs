@@ -27,16 +27,16 @@ use std::time::Duration;
 
 use chaos::RunningCloud;
 use clap::Parser;
-use gleaner_bench_results::{BenchResults, Figure};
+use gleaner_bench::{BenchResults, Figure};
 use load::LoadTimes;
 
-/// Measures the cloud under a simulated fleet and prints a table in Markdown.
+/// Measures the cloud under a simulated fleet.
 #[derive(Parser)]
 struct Args {
     /// 1,000 vehicles for a short time: tests the bench itself; figures of time do not count.
     #[arg(long)]
     quick: bool,
-    /// Folder for results.json, results.md and report.html
+    /// Folder for results.json, tables, figures and report.html
     #[arg(long, value_name = "DIR", default_value = "target/bench/fleet")]
     out: PathBuf,
     /// Number of vehicles under load
@@ -73,11 +73,11 @@ fn main() -> ExitCode {
         Ok(figures) => {
             results.figures = figures;
             results.machine.add_load("load after");
-            if let Err(failure) = results.store(&args.out) {
+            let stored = results.store(&args.out).and_then(|()| gleaner_bench::render(&args.out));
+            if let Err(failure) = stored {
                 eprintln!("{failure}");
                 return failure.exit.into();
             }
-            println!("\nresults and page: {}", args.out.display());
             // In a short run, only errors count.
             let mut counted = results.figures.iter().filter(|it| !args.quick || it.is_of_errors());
             ExitCode::from(u8::from(!counted.all(Figure::is_met)))
@@ -103,7 +103,6 @@ async fn measure(args: &Args) -> Result<Vec<Figure>, String> {
     };
     let kills = args.kills.unwrap_or(if args.quick { 2 } else { 60 });
     let mut figures = Vec::new();
-    println!("| measurement | goal | median | spread | runs | |\n|---|---|---|---|---|---|");
     if vehicles > 0 {
         figures.extend(load::figures(vehicles, &times).await?);
     }

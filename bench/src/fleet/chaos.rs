@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::Duration;
 
-use gleaner_bench_results::{Figure, quantile};
+use gleaner_bench::{Figure, quantile};
 use hyper::Method;
 use serde::Deserialize;
 use tokio::task::JoinSet;

@@ -1,10 +1,9 @@
 //! Several benchmarks, one after the other, and what each of them ended with.
 
-use std::fmt::Write as _;
+use std::fmt::{self, Write as _};
 use std::fs;
 use std::path::Path;
 
-use crate::markdown::table;
 use crate::results::BenchResults;
 
 /// Name of the file with the output of a benchmark, beside its results.
@@ -78,35 +77,29 @@ impl BenchEnd {
 }
 
 impl SequenceEntry {
-    /// Returns a table of all benchmarks, with the reasons below it.
+    /// Returns a list of all benchmarks, with the reasons of what was skipped or failed.
     pub fn to_markdown(entries: &[Self]) -> String {
-        let mut text = "# Gleaner bench: all\n".to_owned();
-        let heads = ["benchmark", "end", "goals met", "s"].map(str::to_owned);
-        let rows = entries.iter().map(|entry| {
-            let (end, met) = match &entry.end {
-                BenchEnd::Measured { goals: 0, .. } => ("measured", "-".to_owned()),
-                BenchEnd::Measured { goals, missed, .. } => {
-                    ("measured", format!("{} of {goals}", goals - missed))
-                }
-                BenchEnd::Skipped(_) => ("skipped", "-".to_owned()),
-                BenchEnd::Failed(_) => ("failed", "-".to_owned()),
-            };
-            vec![entry.bench.clone(), end.to_owned(), met, format!("{:.0}", entry.seconds)]
-        });
-        table(&mut text, &heads, rows);
-        text.push('\n');
-        for SequenceEntry { bench, end, .. } in entries {
-            let reasons: Vec<&str> = match end {
-                BenchEnd::Measured { skipped_parts, .. } => {
-                    skipped_parts.iter().map(String::as_str).collect()
-                }
-                BenchEnd::Skipped(reason) | BenchEnd::Failed(reason) => vec![reason],
-            };
-            for reason in reasons {
-                let _ = writeln!(text, "- {bench}: {reason}");
+        let mut text = "# Gleaner bench: all\n\n".to_owned();
+        for Self { bench, seconds, end } in entries {
+            let _ = writeln!(text, "- {bench}, {seconds:.0} s: {end}");
+            if let BenchEnd::Measured { skipped_parts, .. } = end {
+                skipped_parts.iter().for_each(|part| _ = writeln!(text, "  - {part}"));
             }
         }
         text
+    }
+}
+
+impl fmt::Display for BenchEnd {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Measured { goals: 0, .. } => f.write_str("measured"),
+            Self::Measured { goals, missed, .. } => {
+                write!(f, "measured, {} of {goals} goals met", goals - missed)
+            }
+            Self::Skipped(reason) => write!(f, "skipped: {reason}"),
+            Self::Failed(reason) => write!(f, "FAILED: {reason}"),
+        }
     }
 }
 
@@ -147,7 +140,8 @@ mod tests {
         assert_eq!(read("", false), BenchEnd::Failed("exit status: 101".to_owned()));
         let entry = |bench: &str, end| SequenceEntry { bench: bench.to_owned(), seconds: 1.0, end };
         let text = SequenceEntry::to_markdown(&[entry("rtt", skipped), entry("replay", failed)]);
-        assert!(text.contains("| rtt | skipped | - | 1 |"), "{text}");
-        assert!(text.ends_with("- rtt: no player\n- replay: exit status: 101: no Python\n"));
+        let rows =
+            "- rtt, 1 s: skipped: no player\n- replay, 1 s: FAILED: exit status: 101: no Python\n";
+        assert!(text.ends_with(rows), "{text}");
     }
 }

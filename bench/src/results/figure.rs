@@ -4,7 +4,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use crate::statistics::Summary;
+use crate::statistics::median;
 
 /// A bound that a median should keep.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -49,18 +49,17 @@ impl Figure {
         Self { name: name.to_owned(), unit: unit.to_owned(), goal: None, values }
     }
 
-    /// Returns the statistics of the values; `None` if one could not be measured.
-    pub fn summary(&self) -> Option<Summary> {
-        let values: Option<Vec<f64>> = self.values.iter().copied().collect();
-        Summary::of(&values?)
+    /// Returns the median of the values; `None` if one could not be measured.
+    fn median(&self) -> Option<f64> {
+        median(&self.values.iter().copied().collect::<Option<Vec<f64>>>()?)
     }
 
     /// Returns whether the median keeps the goal. What was not measured does not.
     pub fn is_met(&self) -> bool {
         let Some(goal) = self.goal else { return true };
-        self.summary().is_some_and(|summary| match goal {
-            Goal::AtLeast(least) => summary.median >= least,
-            Goal::AtMost(most) => summary.median <= most,
+        self.median().is_some_and(|median| match goal {
+            Goal::AtLeast(least) => median >= least,
+            Goal::AtMost(most) => median <= most,
         })
     }
 
@@ -68,39 +67,15 @@ impl Figure {
     pub fn is_of_errors(&self) -> bool {
         self.goal == Some(Goal::AtMost(0.0))
     }
-
-    /// Returns the cells of the row: name, goal, median, spread, runs, and whether it is met.
-    pub fn cells(&self) -> [String; 6] {
-        let unit = &self.unit;
-        let goal = match self.goal {
-            Some(Goal::AtLeast(goal)) => format!(">= {goal} {unit}"),
-            Some(Goal::AtMost(goal)) => format!("<= {goal} {unit}"),
-            None => "-".to_owned(),
-        };
-        let result = match (self.goal, self.is_met()) {
-            (None, _) => "",
-            (Some(_), true) => "met",
-            (Some(_), false) => "not met",
-        };
-        let (median, spread) = match self.summary() {
-            Some(Summary { median, min, max, .. }) => {
-                let digits = if median.abs() < 100.0 { 2 } else { 0 };
-                let number = |value: f64| format!("{value:.digits$}");
-                (
-                    format!("{} {unit}", number(median)),
-                    format!("{} to {}", number(min), number(max)),
-                )
-            }
-            None => ("not measured".to_owned(), "-".to_owned()),
-        };
-        let runs = self.values.len().to_string();
-        [self.name.clone(), goal, median, spread, runs, result.to_owned()]
-    }
 }
 
 impl fmt::Display for Figure {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "| {} |", self.cells().join(" | "))
+        match self.median() {
+            Some(median) => write!(f, "{}: {median:.2} {}", self.name, self.unit)?,
+            None => write!(f, "{}: not measured", self.name)?,
+        }
+        f.write_str(if self.is_met() { "" } else { " (goal not met)" })
     }
 }
 
@@ -112,13 +87,10 @@ mod tests {
     fn a_goal_is_for_the_median_and_what_is_not_measured_misses_it() {
         let row = Figure::at_most("latency", "us", 20.0, &[10.0, 19.0, 400.0]);
         assert!(row.is_met());
-        assert_eq!(
-            row.to_string(),
-            "| latency | <= 20 us | 19.00 us | 10.00 to 400.00 | 3 | met |"
-        );
         assert!(!Figure::at_least("rate", "Hz", 20.0, &[10.0]).is_met());
         let missing = Figure::at_most("errors", "", 0.0, &[f64::NAN]);
-        assert!(!missing.is_met() && missing.to_string().contains("not measured"), "{missing}");
+        assert!(!missing.is_met() && missing.values == [None]);
+        assert_eq!(missing.to_string(), "errors: not measured (goal not met)");
         let unknown = Figure::at_most("a", "", f64::NAN, &[1.0]);
         let text = serde_json::to_string(&unknown).unwrap();
         assert_eq!(serde_json::from_str::<Figure>(&text).unwrap(), unknown);

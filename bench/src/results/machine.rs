@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use serde::{Deserialize, Serialize};
@@ -34,6 +34,11 @@ impl Machine {
         for (name, path) in FILES {
             machine.add(name, first_line(Path::new(path)));
         }
+        let isolated = machine.facts.entry("cores that are isolated".to_owned()).or_default();
+        if isolated.is_empty() {
+            *isolated = "none".to_owned();
+        }
+        machine.add_version("power mode", Command::new("nvpmodel").arg("-q"));
         machine.add("processor", value_of("/proc/cpuinfo", "model name"));
         machine.add("memory", value_of("/proc/meminfo", "MemTotal"));
         machine.add("architecture", Some(std::env::consts::ARCH.to_owned()));
@@ -67,6 +72,28 @@ impl Machine {
             load.map(|load| load.split_whitespace().take(3).collect::<Vec<_>>().join(", "));
         self.add(name, averages);
     }
+}
+
+/// The folder of `/sys`. Another one, with the files of another machine, is for tests only.
+pub(crate) fn sysfs() -> PathBuf {
+    std::env::var_os("GLEANER_BENCH_SYSFS").map_or_else(|| "/sys".into(), PathBuf::from)
+}
+
+/// The files and folders in `folder`, in the order of their names.
+pub(crate) fn files(folder: &Path) -> Vec<PathBuf> {
+    let entries = fs::read_dir(folder).into_iter().flatten().flatten();
+    let mut files: Vec<PathBuf> = entries.map(|entry| entry.path()).collect();
+    files.sort();
+    files
+}
+
+/// The content of a file, without white space around it.
+pub(crate) fn text(file: &Path) -> Option<String> {
+    Some(fs::read_to_string(file).ok()?.trim().to_owned())
+}
+
+pub(crate) fn number(file: &Path) -> Option<u64> {
+    text(file)?.parse().ok()
 }
 
 /// Returns the first line of a file; a string of a device tree ends with a zero byte.

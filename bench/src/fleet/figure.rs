@@ -1,6 +1,6 @@
 //! A measured figure beside the promised one.
 
-use gleaner_bench_results::Figure;
+use gleaner_bench::Figure;
 
 /// Returns a figure that must not exceed `most`.
 pub fn at_most(name: &str, unit: &str, most: f64, value: f64) -> Figure {
