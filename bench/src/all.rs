@@ -24,7 +24,7 @@ const BENCHMARKS: [(&str, &str); 9] = [
     ("inference", "5 minutes"),
     ("scale", "24 minutes"),
     ("isolation", "28 minutes"),
-    ("rtt", "two hours"),
+    ("rtt", "two to three hours"),
 ];
 
 /// Facts about the machine, by shell commands that change nothing. `gleaner` is that of this bench.

@@ -101,7 +101,7 @@ enum BenchCommand {
         #[command(flatten)]
         options: rtt::NodeOptions,
     },
-    /// Makes the tables, the figures and the page of results anew.
+    /// Makes the tables, the figures and the page of stored results.
     Render {
         /// The folder of the results.
         folder: PathBuf,

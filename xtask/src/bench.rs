@@ -11,7 +11,7 @@ use crate::steps::{self, Steps};
 use crate::venv;
 
 /// Packages of the stand-in for ROS 2.
-const STAND_IN: [&str; 3] = ["cyclonedds", "numpy", "opencv-python-headless"];
+const STAND_IN: [&str; 4] = ["cyclonedds", "numpy", "onnxruntime", "opencv-python-headless"];
 
 /// Runs the benchmark that the first argument names, or compares results.
 pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
@@ -25,9 +25,9 @@ pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, F
                 return Ok(measured);
             }
             let [base, head] = revisions::runs(checkout).map(OsString::from);
-            compare(checkout, &["compare".into(), base, head])
+            analyse(checkout, &["compare".into(), base, head])
         }
-        ("compare", _) => compare(checkout, arguments),
+        ("compare" | "render", _) => analyse(checkout, arguments),
         _ => measure(checkout, name, arguments),
     }
 }
@@ -65,7 +65,8 @@ fn parts(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
     steps::run(&mut bench, "see the first error above").map(|()| Exit::Ok)
 }
 
-fn compare(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
+fn analyse(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
+    venv::set_up_for_tests(checkout)?;
     setup::binaries(checkout, &["gleaner-bench"])?;
     start(checkout, "gleaner-bench", arguments)
 }
