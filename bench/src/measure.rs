@@ -4,6 +4,7 @@ use std::fmt;
 use std::panic::{self, AssertUnwindSafe};
 use std::path::{Path, PathBuf};
 
+use gleaner_test_support::random::XorShift64;
 use gleaner_tests::root;
 use rustix::time::{ClockId, clock_gettime};
 
@@ -53,16 +54,10 @@ pub fn timed<T>(times: u64, work: impl FnOnce() -> T) -> (f64, T) {
     ((now_us() - started_us) / times as f64, result)
 }
 
-/// The numbers below `count` in an order by `random`, a seed above 0, which changes.
-pub fn shuffled(count: usize, random: &mut u64) -> Vec<usize> {
+/// The numbers below `count` in an order by `random`: Fisher and Yates.
+pub fn shuffled(count: usize, random: &mut XorShift64) -> Vec<usize> {
     let mut order: Vec<usize> = (0..count).collect();
-    // Fisher and Yates.
-    for last in (1..count).rev() {
-        *random ^= *random << 13;
-        *random ^= *random >> 7;
-        *random ^= *random << 17;
-        order.swap(last, (*random % (last as u64 + 1)) as usize);
-    }
+    (1..count).rev().for_each(|last| order.swap(last, random.below(last + 1)));
     order
 }
 

@@ -106,7 +106,7 @@ pub async fn figures(count: usize, times: &LoadTimes) -> Result<Vec<Figure>, Str
 
     let revoked = &fleet.vehicles[count + SILENT];
     let cut_s = measure_removal(revoked, &simulation, &mut administrator).await?;
-    add(at_most("a vehicle that is removed is cut off after", "s", 5.0, cut_s));
+    add(at_most("a revoked vehicle is disconnected after", "s", 5.0, cut_s));
     let mut silent_s = Vec::new();
     for link in silent {
         silent_s.push(link.await.map_err(|error| error.to_string())?);

@@ -7,6 +7,7 @@ use gleaner_bench::{
     BenchResults, EnergyMeter, Growth, GrowthCurve, PartEnergy, Reception, Series, SeriesGroup,
 };
 use gleaner_dds::{Dds, DdsOptions};
+use gleaner_test_support::random::XorShift64;
 
 use super::core_split::CoreSplit;
 use super::node::NodeSide;
@@ -109,7 +110,7 @@ impl Comparison<'_> {
         let conditions =
             TurnConditions { workload, answers: &answers, split, meter, idle, seconds };
         let (mut turns, mut given_up) = (Turns::new(), BTreeSet::new());
-        let mut random = seed.max(1);
+        let mut random = XorShift64(seed.max(1));
         let (mut number, count) = (0, rounds * sides.len() as u32);
         for round in 1..=rounds {
             for index in shuffled(sides.len(), &mut random) {

@@ -57,7 +57,7 @@ impl Workload {
     /// The workloads of the paper.
     pub(super) const PAPER: [Self; 3] = [Self::ImuSpectrum, Self::Brake1080, Self::Detector];
 
-    /// Returns its title, with the limit of socket buffers.
+    /// Returns its title, for images with the limit of socket buffers.
     pub(super) fn title(self, buffer: u64) -> String {
         let what = match self {
             Self::Empty => "IMU at 100 Hz, empty",
@@ -70,7 +70,7 @@ impl Workload {
         };
         // Powers of two are written by people in MiB, the usual limit of Linux in bytes.
         match buffer {
-            0 => what.to_owned(),
+            _ if buffer == 0 || !self.is_of_images() => what.to_owned(),
             _ if buffer.is_multiple_of(1 << 20) => {
                 format!("{what}, socket buffers of {} MiB", buffer >> 20)
             }

@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 use std::hint::black_box;
 
 use gleaner_bench::{BenchResults, Figure, Series, SeriesGroup};
+use gleaner_test_support::random::XorShift64;
 use gleaner_tests::{TempFolder, replay, root};
 
 use super::drives::{self, FRAME_BYTES};
@@ -26,7 +27,7 @@ type Times = BTreeMap<&'static str, Vec<f64>>;
 pub(super) fn measure(quick: bool, seed: u64, results: &mut BenchResults) {
     eprintln!("host calls, columns and frames");
     let (blocks, rounds) = if quick { (1, 1) } else { (5, 6) };
-    let [native, wasm, python] = measured(blocks, rounds, &mut seed.max(1));
+    let [native, wasm, python] = measured(blocks, rounds, &mut XorShift64(seed.max(1)));
     let of_kinds =
         |name| [("native", &native, name), ("wasm", &wasm, name), ("Python", &python, name)];
     results.groups.push(group("A host call, now-ns", ("ns", 1.0), "native", &of_kinds("call")));
@@ -99,7 +100,7 @@ impl<'a> TimedWork<'a> {
 
 /// Measures calls of a component and native ones, in an order by `random` in each round, and those
 /// in Python after each block of rounds.
-fn measured(blocks: u64, rounds: u64, random: &mut u64) -> [Times; 3] {
+fn measured(blocks: u64, rounds: u64, random: &mut XorShift64) -> [Times; 3] {
     let inputs = FilledInputs::new(Vec::new());
     let field = inputs.imu.field("linear_acceleration.x").expect("a field of an IMU");
     let sample = inputs.camera.newest().expect("no holds are refused").expect("a frame");

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use gleaner_bench::{BenchResults, Series, SeriesGroup};
 use gleaner_lambda::{Decision, twins_differ};
+use gleaner_test_support::random::XorShift64;
 use gleaner_tests::drive::{TopicMessages, of_topics};
 use gleaner_tests::{LambdaCopy, TempFolder};
 use imu_fft::road::Road;
@@ -45,7 +46,7 @@ struct SideValues {
 
 /// Measures all workloads, in an order by `seed`.
 pub(super) fn measure(quick: bool, seed: u64, results: &mut BenchResults) {
-    let mut random = seed.max(1);
+    let mut random = XorShift64(seed.max(1));
     let turns = if quick { 1 } else { 15 };
     let mut cpu = Vec::new();
     for workload in [RecordedWorkload::imu(quick), RecordedWorkload::camera(quick)] {
@@ -128,7 +129,7 @@ impl RecordedWorkload {
         self.lambdas[usize::from(side.twin() == Twin::Python)].path()
     }
 
-    fn measure(&self, turns: usize, random: &mut u64) -> Vec<SideValues> {
+    fn measure(&self, turns: usize, random: &mut XorShift64) -> Vec<SideValues> {
         let mut values: BTreeMap<usize, SideValues> = BTreeMap::new();
         let mut expected: Option<Vec<Decision>> = None;
         for _ in 0..turns {
