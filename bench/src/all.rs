@@ -113,7 +113,8 @@ fn measure(bench: &str, quick: bool, folder: &Path) -> Result<(BenchEnd, bool), 
     command.arg(bench).arg("--out").arg(folder).args(quick.then_some("--quick"));
     command.stdin(Stdio::null()).stdout(output).stderr(errors);
     let (status, is_ended) = until_end(&mut command).map_err(failed)?;
-    Ok((BenchEnd::read(folder, status.success(), &status.to_string()), is_ended))
+    let is_skipped = status.code() == Some(crate::SKIPPED.into());
+    Ok((BenchEnd::read(folder, is_skipped, &status.to_string()), is_ended))
 }
 
 /// Returns the output of [`FACTS`]; what is missing here is named, too.

@@ -20,10 +20,13 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode};
 
 use clap::{Parser, Subcommand};
-use gleaner_base::Failure;
+use gleaner_base::{Exit, Failure};
 use gleaner_bench::BenchResults;
 use gleaner_tests::root;
 use isolation::BenchGuest;
+
+/// Exit code of a benchmark that cannot run on this machine.
+const SKIPPED: u8 = 3;
 
 /// Measures Gleaner against its performance goals; ends with exit code 1 if one is not met.
 #[derive(Parser)]
@@ -48,7 +51,7 @@ enum BenchCommand {
         skip: Vec<String>,
     },
     /// The table and the figures of the paper: three workloads, each as native ROS 2, in Python and
-    /// in wasm, in 30 minutes; needs gleaner-player.
+    /// in wasm, in some 20 minutes; needs gleaner-player.
     Paper {
         #[command(flatten)]
         options: rtt::PaperOptions,
@@ -150,9 +153,9 @@ fn measure(command: &BenchCommand, args: &Args) -> Result<ExitCode, Failure> {
             Some(Ok(is_good)) => return Ok(ExitCode::from(u8::from(!is_good))),
             Some(Err(why)) => {
                 println!("skipped: {why}");
-                return Ok(ExitCode::SUCCESS);
+                return Ok(ExitCode::from(SKIPPED));
             }
-            None => {}
+            None => live::end_with_the_starter(),
         }
     } else if command.is_on_one_core()
         && let Err(error) = measure::bind_to_one_core()
@@ -162,21 +165,39 @@ fn measure(command: &BenchCommand, args: &Args) -> Result<ExitCode, Failure> {
     let folder = args.out.clone().unwrap_or_else(|| root().join("target/bench").join(name));
     let quick = args.quick;
     let mut results = BenchResults::new(name, quick);
-    if command.is_resumed() {
-        results = BenchResults::read(&folder)?;
-    }
     add_versions(&mut results);
+    if command.is_resumed() {
+        results = resumed(results, &folder)?;
+    } else {
+        BenchResults::keep_previous(&folder)?;
+    }
     let measured = measure::caught(|| run(command, quick, &mut results, &folder));
-    let has_failed = measured.is_err();
+    results.is_complete = measured.is_ok();
     if let Err(why) = &measured {
         eprintln!("error: the benchmark `{name}` failed\n  cause: {why}");
-        results.notes.push(format!("The benchmark failed; the rows before it count: {why}"));
     }
+    measured.unwrap_or(Ok(()))?;
     results.machine.add_load("load after");
     results.store(&folder)?;
     gleaner_bench::render(&folder)?;
-    measured.unwrap_or(Ok(()))?;
-    Ok(ExitCode::from(u8::from(has_failed || !results.is_good())))
+    Ok(ExitCode::from(u8::from(!(results.is_complete && results.is_good()))))
+}
+
+/// Returns the results in `folder`, which an earlier part of the same run has stored.
+fn resumed(now: BenchResults, folder: &Path) -> Result<BenchResults, Failure> {
+    let mut stored = BenchResults::read(folder)?;
+    let mut changed = now.changed_facts(&stored);
+    if (&stored.bench, stored.is_quick) != (&now.bench, now.is_quick) {
+        changed.push(format!("benchmark: {}, before {}", now.bench, stored.bench));
+    }
+    if !changed.is_empty() {
+        let message = format!("cannot resume the results in `{}`", folder.display());
+        let mut failure = Failure::new(Exit::Usage, message);
+        failure.causes = changed;
+        return Err(failure.with_help("measure again without --resume, into another --out DIR"));
+    }
+    stored.is_complete = false;
+    Ok(stored)
 }
 
 fn run(
@@ -186,6 +207,8 @@ fn run(
     folder: &Path,
 ) -> Result<(), Failure> {
     let mut save = |results: &BenchResults| results.store(folder);
+    // What is aborted can be resumed.
+    save(results)?;
     match command {
         BenchCommand::Rtt { options } => return rtt::measure(quick, options, results, &mut save),
         BenchCommand::Paper { options } => return rtt::paper(quick, options, results, &mut save),
@@ -255,6 +278,7 @@ impl BenchCommand {
 /// Adds the versions of what is measured.
 fn add_versions(results: &mut BenchResults) {
     let machine = &mut results.machine;
+    machine.add("net.core.rmem_max", live::limit_before());
     machine.add_version("measured", Command::new("date").args(["-u", "+%Y-%m-%d %H:%M UTC"]));
     // A tarball states it in a file, and may be unpacked in a checkout of something else.
     let mut revision = Command::new("cat");

@@ -4,7 +4,9 @@ use std::ffi::OsString;
 
 use gleaner_base::{Exit, Failure};
 
+use crate::architecture::Architecture;
 use crate::checkout::{Checkout, FAMILIES};
+use crate::onnxruntime;
 use crate::revisions;
 use crate::setup;
 use crate::steps::{self, Steps};
@@ -52,6 +54,8 @@ fn measure(checkout: &Checkout, name: &str, arguments: &[OsString]) -> Result<Ex
     {
         println!("without the stand-in for ROS 2:\n{failure}");
     }
+    // Lambdas and programs without Gleaner run a model by the same library.
+    onnxruntime::fetch(checkout, Architecture::of_this_machine());
     steps.begin("gleaner-bench");
     setup::binaries(checkout, &["gleaner-bench"])?;
     steps.begin("measurements");
@@ -72,7 +76,7 @@ fn analyse(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure>
 }
 
 fn start(checkout: &Checkout, program: &str, arguments: &[OsString]) -> Result<Exit, Failure> {
-    let mut bench = checkout.command(checkout.program(program));
+    let mut bench = onnxruntime::with_models(checkout, program);
     bench.args(arguments);
     steps::run(&mut bench, "see the messages above").map(|()| Exit::Ok)
 }

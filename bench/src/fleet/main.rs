@@ -72,6 +72,7 @@ fn main() -> ExitCode {
     match measured {
         Ok(figures) => {
             results.figures = figures;
+            results.is_complete = true;
             results.machine.add_load("load after");
             let stored = results.store(&args.out).and_then(|()| gleaner_bench::render(&args.out));
             if let Err(failure) = stored {

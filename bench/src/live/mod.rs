@@ -18,7 +18,10 @@ use std::time::Duration;
 
 use gleaner_tests::live::no_player;
 use gleaner_tests::{namespace, root};
-use rustix::process::{Pid, Signal};
+use rustix::process::{
+    Pid, Signal, WaitId, WaitIdOptions, kill_current_process_group, kill_process_group,
+    set_parent_process_death_signal, waitid,
+};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use crate::measure::Twin;
@@ -28,6 +31,9 @@ pub use scale::{ScaleOptions, loads};
 
 /// Environment variable of the process in the private network: the process that started it.
 const ALONE: &str = "GLEANER_BENCH_ALONE";
+
+/// Environment variable of that process: the limit of socket buffers before.
+const LIMIT_BEFORE: &str = "GLEANER_BENCH_LIMIT_BEFORE";
 
 /// The system's limit of socket buffers. It applies to all network namespaces, and can be changed
 /// in the first one only.
@@ -66,14 +72,37 @@ fn start_in_private_network() -> Result<bool, String> {
     let before = std::fs::read_to_string(BUFFER_LIMIT).unwrap_or_default();
     let is_small = before.trim().parse::<u64>().is_ok_and(|bytes| bytes < BUFFER_BYTES);
     let raised = is_small && std::fs::write(BUFFER_LIMIT, BUFFER_BYTES.to_string()).is_ok();
-    let status = until_end(
-        namespace::rerun(ALONE, &std::process::id().to_string()).args(std::env::args_os().skip(1)),
-    );
+    let mut inner = namespace::rerun(ALONE, &std::process::id().to_string());
+    inner.args(std::env::args_os().skip(1)).env(LIMIT_BEFORE, before.trim());
+    let status = until_end(&mut inner);
     // Restored for the other users of this machine, whatever the benchmark has set.
     if raised || std::fs::read_to_string(BUFFER_LIMIT).is_ok_and(|after| after != before) {
         let _ = std::fs::write(BUFFER_LIMIT, before.trim());
     }
     status.map(|(status, _)| status.success()).map_err(|error| error.to_string())
+}
+
+/// Ends this process, in its private network, with all that it has started, once it is asked to or
+/// the process that started it has ended.
+pub fn end_with_the_starter() {
+    let is_asked = Arc::<AtomicBool>::default();
+    let registered = signal_hook::flag::register(SIGTERM, Arc::clone(&is_asked));
+    registered.expect("this signal can be handled");
+    set_parent_process_death_signal(Some(Signal::TERM)).expect("a signal that exists");
+    thread::spawn(move || {
+        while !is_asked.load(Ordering::Relaxed) {
+            thread::sleep(Duration::from_millis(100));
+        }
+        // The group is that of this process: see `until_end`.
+        let _ = kill_current_process_group(Signal::TERM);
+        std::process::exit(128 + SIGTERM);
+    });
+}
+
+/// The limit of socket buffers before this program has changed it; unknown outside of a private
+/// network.
+pub fn limit_before() -> Option<String> {
+    std::env::var(LIMIT_BEFORE).ok()
 }
 
 /// Runs a command to its end. A signal that asks this program to end is passed on to the command
@@ -87,14 +116,19 @@ pub(crate) fn until_end(command: &mut Command) -> io::Result<(ExitStatus, bool)>
     let mut child = command.process_group(0).spawn()?;
     let mut was_asked = false;
     loop {
-        if let Some(status) = child.try_wait()? {
+        let pid = WaitId::Pid(Pid::from_child(&child));
+        let looks = WaitIdOptions::EXITED | WaitIdOptions::NOHANG | WaitIdOptions::NOWAIT;
+        if waitid(pid, looks)?.is_some() {
+            // What it has left, while its id is still its own.
+            let _ = kill_process_group(Pid::from_child(&child), Signal::TERM);
+            let status = child.wait()?;
             return Ok((status, was_asked || is_asked.load(Ordering::Relaxed)));
         }
         if is_asked.swap(false, Ordering::Relaxed) {
             was_asked = true;
             // The group is that of the child, which was not waited for yet.
             let group = Pid::from_child(&child);
-            let _ = rustix::process::kill_process_group(group, Signal::TERM);
+            let _ = kill_process_group(group, Signal::TERM);
         }
         thread::sleep(Duration::from_millis(100));
     }

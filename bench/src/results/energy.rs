@@ -73,7 +73,9 @@ impl EnergyMeter {
         let mut meter = Self::default();
         for zone in files(&sysfs.join("class/powercap")) {
             // `intel-rapl:0` is a processor, `intel-rapl:0:1` a part of it.
-            let is_whole = zone.to_string_lossy().matches(':').count() == 1;
+            let name = zone.file_name().unwrap_or_default().to_string_lossy().into_owned();
+            // `intel-rapl-mmio:0` is the same processor by another way.
+            let is_whole = name.matches(':').count() == 1 && !name.contains("mmio");
             let file = zone.join("energy_uj");
             if let (true, Some(name), Some(range), Some(_)) = (
                 is_whole,
@@ -224,6 +226,9 @@ mod tests {
             ("intel-rapl:0:0/name", "core\n"),
             ("intel-rapl:0:0/max_energy_range_uj", "1000000\n"),
             ("intel-rapl:0:0/energy_uj", "5\n"),
+            ("intel-rapl-mmio:0/name", "package-0\n"),
+            ("intel-rapl-mmio:0/max_energy_range_uj", "1000000\n"),
+            ("intel-rapl-mmio:0/energy_uj", "5\n"),
         ] {
             sysfs.write(&format!("class/powercap/{file}"), content);
         }

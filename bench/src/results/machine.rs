@@ -14,6 +14,9 @@ pub struct Machine {
     pub facts: BTreeMap<String, String>,
 }
 
+/// The environment variable that names another folder in place of `/sys`.
+const SYSFS: &str = "GLEANER_BENCH_SYSFS";
+
 /// A file with a single value, and the fact that it states.
 const FILES: [(&str, &str); 9] = [
     ("board", "/proc/device-tree/model"),
@@ -38,6 +41,8 @@ impl Machine {
         if isolated.is_empty() {
             *isolated = "none".to_owned();
         }
+        let simulated = std::env::var_os(SYSFS).map(|path| path.to_string_lossy().into_owned());
+        machine.add("sensors, simulated", simulated);
         machine.add_version("power mode", Command::new("nvpmodel").arg("-q"));
         machine.add("processor", value_of("/proc/cpuinfo", "model name"));
         machine.add("memory", value_of("/proc/meminfo", "MemTotal"));
@@ -76,7 +81,7 @@ impl Machine {
 
 /// The folder of `/sys`. Another one, with the files of another machine, is for tests only.
 pub(crate) fn sysfs() -> PathBuf {
-    std::env::var_os("GLEANER_BENCH_SYSFS").map_or_else(|| "/sys".into(), PathBuf::from)
+    std::env::var_os(SYSFS).map_or_else(|| "/sys".into(), PathBuf::from)
 }
 
 /// The files and folders in `folder`, in the order of their names.

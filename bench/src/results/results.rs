@@ -1,7 +1,8 @@
 //! The results of one run of a benchmark, and their file.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
+use std::io;
 use std::path::Path;
 
 use gleaner_base::{Exit, Failure, write_atomically};
@@ -12,6 +13,9 @@ use crate::machine::Machine;
 
 /// Version of the format of the JSON file.
 const FORMAT: u32 = 2;
+
+/// Facts that differ between the parts of a run that was resumed.
+const CHANGING: [&str; 4] = ["load before", "load after", "measured", "options"];
 
 /// Name of the file in the folder of a benchmark.
 const FILE: &str = "results.json";
@@ -24,6 +28,8 @@ pub struct BenchResults {
     pub bench: String,
     /// True for a smoke test: its values are not meaningful.
     pub is_quick: bool,
+    /// False as long as the benchmark runs, and if it was ended or failed.
+    pub is_complete: bool,
     /// The machine on which it ran.
     pub machine: Machine,
     /// Rows with a value for each run.
@@ -60,6 +66,8 @@ pub struct Series {
     pub reception: Option<Reception>,
     /// All values.
     pub values: Vec<f64>,
+    /// Numbers of values of each turn, in their order; none for a single turn.
+    pub turns: Vec<usize>,
     /// Costs by name and unit, with a value for each turn.
     pub costs: BTreeMap<String, Vec<f64>>,
     /// Reasons why the values mean nothing; none for valid ones.
@@ -110,6 +118,41 @@ impl BenchResults {
         self.is_quick || self.figures.iter().all(Figure::is_met)
     }
 
+    /// Renames the results in `folder`, if there are some, to `previous.json`.
+    ///
+    /// # Errors
+    ///
+    /// A file that cannot be renamed.
+    pub fn keep_previous(folder: &Path) -> Result<(), Failure> {
+        match fs::rename(folder.join(FILE), folder.join("previous.json")) {
+            Err(error) if error.kind() != io::ErrorKind::NotFound => {
+                let message = format!("cannot rename `{}`", folder.join(FILE).display());
+                Err(Failure::caused_by(Exit::Internal, message, &error)
+                    .with_help("choose a folder that can be written: --out DIR"))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Returns the facts of the machine, and of what is measured, that differ from those of an earlier
+    /// part of the run; its load and the time may.
+    pub fn changed_facts(&self, earlier: &Self) -> Vec<String> {
+        let facts = |results: &Self| {
+            let facts = results.machine.facts.clone().into_iter();
+            facts.filter(|(name, _)| !CHANGING.contains(&name.as_str())).collect::<BTreeMap<_, _>>()
+        };
+        let (now, before) = (facts(self), facts(earlier));
+        let names: BTreeSet<&String> = now.keys().chain(before.keys()).collect();
+        let value = |facts: &BTreeMap<String, String>, name| {
+            facts.get(name).map_or("unknown", String::as_str).to_owned()
+        };
+        names
+            .into_iter()
+            .filter(|name| now.get(*name) != before.get(*name))
+            .map(|name| format!("{name}: {}, before {}", value(&now, name), value(&before, name)))
+            .collect()
+    }
+
     /// Writes `results.json` into `folder`, which it creates. Values that are not numbers, for which
     /// JSON has no form, are left out.
     ///
@@ -120,7 +163,7 @@ impl BenchResults {
         let path = folder.join(FILE);
         let mut measured = self.clone();
         for series in measured.groups.iter_mut().flat_map(|group| &mut group.series) {
-            series.values.retain(|value| value.is_finite());
+            series.retain_finite();
             series.costs.values_mut().for_each(|values| values.retain(|value| value.is_finite()));
         }
         for curve in measured.growths.iter_mut().flat_map(|growth| &mut growth.curves) {
@@ -160,6 +203,17 @@ impl BenchResults {
     }
 }
 
+impl Series {
+    /// Keeps the values that are numbers, and their turns.
+    fn retain_finite(&mut self) {
+        let mut values = self.values.iter();
+        for turn in &mut self.turns {
+            *turn = values.by_ref().take(*turn).filter(|value| value.is_finite()).count();
+        }
+        self.values.retain(|value| value.is_finite());
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -172,7 +226,8 @@ mod tests {
         results.figures.push(Figure::at_most("wake", "us", 20.0, &[18.0, f64::NAN]));
         let costs = [("CPU".to_owned(), vec![f64::NAN, 2.0])].into();
         let values = vec![1.0, f64::INFINITY, 3.0];
-        let series = Series { name: "bare".to_owned(), values, costs, ..Series::default() };
+        let turns = vec![2, 1];
+        let series = Series { name: "bare".to_owned(), values, turns, costs, ..Series::default() };
         results.groups.push(SeriesGroup { series: vec![series], ..SeriesGroup::default() });
         let points = vec![[1.0, 2.0], [2.0, f64::NAN]];
         let curves = vec![GrowthCurve { name: "wasm".to_owned(), points }];
@@ -181,10 +236,24 @@ mod tests {
         results.store(&folder.path("deep/er")).unwrap();
         let read = BenchResults::read(&folder.path("deep/er")).unwrap();
         results.groups[0].series[0].values = vec![1.0, 3.0];
+        results.groups[0].series[0].turns = vec![1, 1];
         results.groups[0].series[0].costs.insert("CPU".to_owned(), vec![2.0]);
         results.growths[0].curves[0].points.truncate(1);
         assert_eq!(read, results);
         assert!(!read.is_good() && read.figures[0].values == [Some(18.0), None]);
+    }
+
+    #[test]
+    fn a_run_goes_on_only_on_the_same_machine_and_revision() {
+        let mut before = BenchResults::new("rtt", false);
+        let now = before.clone();
+        before.machine.add("load before", Some("9".to_owned()));
+        assert_eq!(now.changed_facts(&before), [""; 0]);
+        before.machine.add("revision", Some("abc".to_owned()));
+        before.machine.facts.remove("kernel");
+        let changed = now.changed_facts(&before);
+        assert!(changed[0].starts_with("kernel: ") && changed[0].ends_with(", before unknown"));
+        assert_eq!(changed[1..], ["revision: unknown, before abc"]);
     }
 
     #[test]

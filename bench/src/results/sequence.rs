@@ -41,10 +41,11 @@ pub enum BenchEnd {
 impl BenchEnd {
     /// Reads the end of a benchmark from the folder of its results and of its [`OUTPUT`]. `status`
     /// describes its exit status.
-    pub fn read(folder: &Path, has_succeeded: bool, status: &str) -> Self {
+    pub fn read(folder: &Path, is_skipped: bool, status: &str) -> Self {
         let output = fs::read(folder.join(OUTPUT)).unwrap_or_default();
         let output = String::from_utf8_lossy(&output);
-        if let Ok(results) = BenchResults::read(folder) {
+        let stored = BenchResults::read(folder).ok().filter(|results| results.is_complete);
+        if let Some(results) = stored {
             // The values of a quick run mean nothing.
             let figures = results.figures.iter().filter(|_| !results.is_quick);
             let goals = figures.filter(|figure| figure.goal.is_some());
@@ -57,7 +58,7 @@ impl BenchEnd {
             };
         }
         let reason = output.lines().find_map(|line| line.strip_prefix("skipped: "));
-        if let Some(reason) = reason.filter(|_| has_succeeded) {
+        if let Some(reason) = reason.filter(|_| is_skipped) {
             return Self::Skipped(reason.to_owned());
         }
         let mut words = status.to_owned();
@@ -116,20 +117,25 @@ mod tests {
         results.figures.push(Figure::at_most("slow", "us", 1.0, &[2.0]));
         results.figures.push(Figure::at_most("fast", "us", 3.0, &[2.0]));
         results.figures.push(Figure::without_goal("any", "us", &[2.0]));
+        results.is_complete = true;
         results.notes = vec!["rclpy: skipped: no module".to_owned(), "A note.".to_owned()];
         results.store(&folder.path("rtt")).unwrap();
         let end = BenchEnd::read(&folder.path("rtt"), false, "exit status: 1");
         let skipped_parts = vec!["rclpy: skipped: no module".to_owned()];
         assert_eq!(end, BenchEnd::Measured { goals: 2, missed: 1, skipped_parts });
         assert!(!end.is_good());
+        results.is_complete = false;
+        results.store(&folder.path("rtt")).unwrap();
+        let end = BenchEnd::read(&folder.path("rtt"), false, "signal: 9 (SIGKILL)");
+        assert_eq!(end, BenchEnd::Failed("signal: 9 (SIGKILL)".to_owned()));
     }
 
     #[test]
     fn without_results_a_benchmark_is_skipped_or_failed_with_the_reason() {
         let folder = TestFolder::new();
-        let read = |output: &str, has_succeeded| {
+        let read = |output: &str, is_skipped| {
             fs::write(folder.path(OUTPUT), output).unwrap();
-            BenchEnd::read(&folder.path(""), has_succeeded, "exit status: 101")
+            BenchEnd::read(&folder.path(""), is_skipped, "exit status: 101")
         };
         let skipped = read("skipped: no player\n", true);
         assert_eq!(skipped, BenchEnd::Skipped("no player".to_owned()));

@@ -39,15 +39,24 @@ pub(super) fn of_group(
         let Series { name, values, reception, .. } = series;
         let missing = reception.map_or(f64::NAN, |it| it.sent as f64 - it.answered as f64);
         let row = format!("{}, {name}: samples without an answer", group.name);
-        figures.push(Figure::at_most(&row, "samples", 0.0, &[missing]));
+        figures.push(judged(&row, "samples", 0.0, missing, &[series]));
         let compared = group.series.iter().filter(|other| others.contains(&other.name.as_str()));
         for other in compared {
             for (what, of, goal) in ratios {
                 let row = format!("{}, {name}, against the {}: {what}", group.name, other.name);
                 let ratio = of(values) / of(&other.values);
-                figures.push(Figure::at_most(&row, "times", *goal, &[ratio]));
+                figures.push(judged(&row, "times", *goal, ratio, &[series, other]));
             }
         }
+    }
+}
+
+/// Returns a row whose goal is `most` or less, if the series that it is of are valid.
+fn judged(name: &str, unit: &str, most: f64, value: f64, of: &[&Series]) -> Figure {
+    if of.iter().all(|series| series.invalid.is_empty()) {
+        Figure::at_most(name, unit, most, &[value])
+    } else {
+        Figure::without_goal(name, unit, &[value])
     }
 }
 

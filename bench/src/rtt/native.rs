@@ -25,6 +25,7 @@ use rustdds::{
     DomainParticipantBuilder, QosPolicies, QosPolicyBuilder, RepresentationIdentifier, Topic,
     TopicKind, no_key,
 };
+use rustix::net::{AddressFamily, SocketType, socket, sockopt};
 use rustix::process::{Signal, set_parent_process_death_signal};
 use signal_hook::consts::{SIGINT, SIGTERM};
 
@@ -105,7 +106,9 @@ fn answer(stop: &AtomicBool, options: NodeOptions) {
         publisher.create_datawriter_no_key::<Bytes, NodeAdapter>(&answers, Some(qos.clone()));
     let writer = writer.expect("a writer can be created");
     let lambda = RefCell::new(NodeLambda::new(options));
-    println!("{}", serde_json::json!({"ready": true, "stack": "RustDDS, in one thread"}));
+    let stack = "RustDDS, in one thread";
+    let first = serde_json::json!({"ready": true, "stack": stack, "socket_buffer": granted()});
+    println!("{first}");
     let mut events = Events::with_capacity(16);
     let (clock, mut message, mut wakes) = (Clock::new(0), CdrWriter::new(), 0);
     while !stop.load(Ordering::Relaxed) {
@@ -125,6 +128,14 @@ fn answer(stop: &AtomicBool, options: NodeOptions) {
             }
         }
     }
+}
+
+/// Returns the receive buffer in bytes that the kernel grants each of its sockets, as the ingress
+/// determines it; `None` if it is unknown. The kernel reports twice the size.
+fn granted() -> Option<usize> {
+    let socket = socket(AddressFamily::INET, SocketType::DGRAM, None).ok()?;
+    sockopt::set_socket_recv_buffer_size(&socket, BUFFER_BYTES).ok()?;
+    sockopt::socket_recv_buffer_size(&socket).ok().map(|doubled| doubled / 2)
 }
 
 fn qos() -> QosPolicies {

@@ -53,6 +53,8 @@ const FACTS: [(&str, &str); 5] = [
 impl NodeSide {
     /// Name of the reader that only answers.
     pub(super) const BARE: &'static str = "bare reader";
+    /// Name of the node with the arithmetic of the wasm lambda, without isolation.
+    pub(super) const RUST: &'static str = "native Rust";
     /// Name of the stand-in.
     pub(super) const STAND_IN: &'static str = "stand-in (Cyclone DDS for Python)";
     /// Name of the ROS 2 node.
@@ -64,7 +66,7 @@ impl NodeSide {
     pub(super) fn name(&self) -> String {
         let name = match self.kind {
             NodeKind::Bare => Self::BARE,
-            NodeKind::Rust => "native Rust",
+            NodeKind::Rust => Self::RUST,
             NodeKind::StandIn => Self::STAND_IN,
             NodeKind::Rclpy => Self::RCLPY,
             NodeKind::RclpyKeepingMemory => "rclpy, memory kept",

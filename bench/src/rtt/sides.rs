@@ -1,6 +1,6 @@
 //! One side of a comparison: it is started, fed for one turn, and ended.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::os::unix::fs::symlink;
 use std::process::Command;
 use std::thread::sleep;
@@ -20,9 +20,14 @@ use super::workload::Workload;
 use crate::answers::{RttAnswer, RttReceiver};
 use crate::measure::{Twin, pss_mib};
 
-/// Interval of reading the memory of a side. A process waits meanwhile, for less than 1 in 1,000
-/// samples of an IMU at 100 Hz.
-const MEMORY_INTERVAL: Duration = Duration::from_secs(4);
+/// Interval of reading the memory of a side, and the state of the machine. A process waits
+/// meanwhile, for less than 1 in 1,000 samples of an IMU at 100 Hz.
+const LOOK_INTERVAL: Duration = Duration::from_secs(4);
+
+const NO_CPU: &str = "CPU is not measured: a process started or ended in the measured time, or \
+                      `/proc` has no `children` or no `schedstat`.";
+const NO_MEMORY: &str = "memory is not measured: `/proc` has no `children`, or no `smaps_rollup` \
+                         that can be read.";
 
 pub(super) enum Side {
     /// A lambda in `gleaner run`.
@@ -31,11 +36,10 @@ pub(super) enum Side {
     Node(NodeSide),
 }
 
-/// A lambda, and its status at the end of the last turn.
+/// A lambda.
 pub(super) struct LambdaSide {
     pub(super) kind: Twin,
     pub(super) mode: LambdaMode,
-    pub(super) last: Option<Box<LiveStatus>>,
 }
 
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -62,6 +66,7 @@ pub(super) struct TurnConditions<'a> {
 }
 
 /// The measurements of one turn.
+#[derive(Default)]
 pub(super) struct Turn {
     /// All answers, in the order of their arrival.
     pub(super) answers: Vec<RttAnswer>,
@@ -69,14 +74,19 @@ pub(super) struct Turn {
     from_ns: i64,
     /// Samples that were sent, with those of the warm-up.
     pub(super) sent: u64,
-    /// Costs by name and unit, of all processes of the side and of the machine.
+    /// Costs by name and unit, of all processes of the side and of the machine. What is unknown is
+    /// absent, never 0.
     pub(super) costs: Vec<(String, f64)>,
+    /// Reasons why some costs are absent.
+    pub(super) absent: Vec<&'static str>,
     /// Memory over the measured time: seconds, and MB.
     pub(super) memory: Vec<[f64; 2]>,
     /// Facts about the side.
     pub(super) facts: BTreeMap<String, String>,
+    /// Of a lambda, at its end.
+    pub(super) live: Option<Box<LiveStatus>>,
     /// Reasons why the turn is invalid.
-    pub(super) invalid: Vec<String>,
+    pub(super) invalid: BTreeSet<String>,
 }
 
 struct RunningSide {
@@ -90,6 +100,12 @@ impl Turn {
     /// Returns the answers to samples after the warm-up.
     pub(super) fn counted(&self) -> impl Iterator<Item = &RttAnswer> {
         self.answers.iter().filter(|answer| answer.stamp_ns() >= self.from_ns)
+    }
+
+    /// Returns the number of faults of a lambda, of wakes skipped after them, and of restarts.
+    pub(super) fn faults(&self) -> u64 {
+        let live = self.live.as_deref();
+        live.map_or(0, |live| live.faults + live.backed_off + u64::from(live.restarts))
     }
 }
 
@@ -144,6 +160,10 @@ impl Side {
         matches!(self, Self::Node(NodeSide { kind: NodeKind::Bare, .. }))
     }
 
+    pub(super) fn is_lambda(&self) -> bool {
+        matches!(self, Self::Lambda(_))
+    }
+
     fn is_unchecked(&self) -> bool {
         matches!(self, Self::Lambda(LambdaSide { mode: LambdaMode::Unchecked, .. }))
     }
@@ -157,60 +177,34 @@ impl Side {
     /// # Panics
     ///
     /// With its standard error, if it fails.
-    pub(super) fn turn(&mut self, conditions: &TurnConditions<'_>) -> Result<Turn, String> {
+    pub(super) fn turn(&self, conditions: &TurnConditions<'_>) -> Result<Turn, String> {
         let &TurnConditions { workload, answers, split, seconds, .. } = conditions;
         let [warm_up, measured] = seconds;
         let before = Throttling::now();
-        let (running, mut facts) = split.for_side(|| self.start(workload))?;
+        let (running, facts) = split.for_side(|| self.start(workload))?;
         answers.take();
         let player = workload.player(self.is_bare(), warm_up + measured);
         let mut arguments = vec!["--stamp", "monotonic", "--wait", "1"];
         arguments.extend(player.iter().map(String::as_str));
         let player = play(&arguments);
-        let mut received = running.first(answers);
+        let mut turn = Turn { answers: running.first(answers), facts, ..Turn::default() };
+        turn.from_ns = turn.answers[0].stamp_ns() + i64::from(warm_up) * 1_000_000_000;
         sleep(Duration::from_secs(warm_up.into()));
-        let (clock, cpu_before) = (Clock::new(0), running.cpu_ns());
-        let began_ns = clock.now();
-        let mut memory: Vec<[f64; 2]> = Vec::new();
-        let measured = Duration::from_secs_f64(0.9 * f64::from(measured));
-        let energy = conditions.meter.watch(measured, |elapsed| {
-            let due = MEMORY_INTERVAL * memory.len() as u32;
-            // Without checks, the process also has the compiler of its component.
-            if elapsed >= due && !self.is_unchecked() {
-                memory.push([due.as_secs_f64(), running.memory_mb()]);
-            }
-        });
-        let (cpu_ns, ended_ns) = (running.cpu_ns().saturating_sub(cpu_before), clock.now());
-        let after = Throttling::now();
+        // A player that ends by itself may do so a little earlier.
+        let share = if workload.is_looped() { 1.0 } else { 0.9 };
+        let measured = Duration::from_secs_f64(share * f64::from(measured));
+        // Without checks, the process also has the compiler of its component.
+        running.measure(measured, conditions, !self.is_unchecked(), &mut turn);
         if workload.is_looped() {
             player.signal("INT");
         }
-        let sent = player.finish().sent()[workload.event().0];
+        turn.sent = player.finish().sent()[workload.event().0];
         // The last answers may still be on their way.
         sleep(Duration::from_millis(500));
-        received.extend(answers.take());
-        self.end(running, &mut facts);
-        let in_span = received.iter().filter(|it| (began_ns..ended_ns).contains(&it.arrived_ns));
-        let (span_s, wakes) = ((ended_ns - began_ns) as f64 / 1e9, in_span.count());
-        let cpu = ("CPU, % of a core".to_owned(), cpu_ns as f64 / 1e7 / span_s);
-        let mut costs = vec![cpu];
-        for (name, value) in [
-            ("memory (PSS), MB", memory.last().map(|[_, mb]| *mb)),
-            ("temperature, °C", after.temperature),
-            ("clock, MHz", after.clock_mhz),
-        ] {
-            costs.extend(value.map(|value| (name.to_owned(), value)));
-        }
-        costs.extend(energy.iter().flat_map(|part| power(part, conditions.idle, span_s, wakes)));
-        Ok(Turn {
-            from_ns: received[0].stamp_ns() + i64::from(warm_up) * 1_000_000_000,
-            answers: received,
-            sent,
-            costs,
-            memory,
-            facts,
-            invalid: after.since(&before),
-        })
+        turn.answers.extend(answers.take());
+        turn.invalid.extend(Throttling::now().since(&before));
+        turn.live = self.end(running, &mut turn.facts);
+        Ok(turn)
     }
 
     fn start(&self, workload: Workload) -> Result<(RunningSide, BTreeMap<String, String>), String> {
@@ -229,32 +223,45 @@ impl Side {
         }
     }
 
-    /// Ends a side, and adds what it states at its end.
-    fn end(&mut self, running: RunningSide, facts: &mut BTreeMap<String, String>) {
+    /// Ends a side, and adds what it states at its end. Returns the last status of a lambda.
+    fn end(
+        &self,
+        running: RunningSide,
+        facts: &mut BTreeMap<String, String>,
+    ) -> Option<Box<LiveStatus>> {
         let finished = running.started.interrupt();
         match self {
-            Self::Lambda(side) => {
+            Self::Lambda(_) => {
                 let runtime = finished.lines.iter().find_map(|line| model_runtime(line));
                 facts.extend(runtime.map(|runtime| ("model".to_owned(), runtime)));
                 let live = finished.ended();
                 let granted = live.network.buffer_granted;
                 facts.insert("socket buffer, B".to_owned(), granted.to_string());
-                side.last = Some(Box::new(live));
+                Some(Box::new(live))
             }
-            Self::Node(_) => assert!(finished.status.success(), "{}", finished.stderr),
+            Self::Node(_) => {
+                assert!(finished.status.success(), "{}", finished.stderr);
+                None
+            }
         }
     }
 
-    /// Adds the times of the stages of a lambda, in its last turn. Goals are for small samples: an
-    /// image is copied into its slot on the way.
-    pub(super) fn stages(&self, workload: Workload, group: &str, figures: &mut Vec<Figure>) {
+    /// Adds the times of the stages of a lambda, in its last turn. Goals are for small samples, as an
+    /// image is copied into its slot on the way, and for a valid series.
+    pub(super) fn stages(
+        &self,
+        workload: Workload,
+        group: &str,
+        (last, is_valid): (&Turn, bool),
+        figures: &mut Vec<Figure>,
+    ) {
         let Self::Lambda(side) = self else { return };
-        let Some(live) = &side.last else { return };
+        let Some(live) = &last.live else { return };
         let goals = match side.kind {
             Twin::Rust => [20.0, 100.0],
             Twin::Python => [30.0, 150.0],
         };
-        let has_goals = !workload.is_of_images() && !self.is_unchecked();
+        let has_goals = is_valid && !workload.is_of_images() && !self.is_unchecked();
         for (what, stats, has_goal) in [
             ("sample received to lambda entered", live.wake_latency, has_goals),
             ("in the lambda", live.run_time, false),
@@ -291,24 +298,77 @@ impl RunningSide {
         }
     }
 
-    fn processes(&self) -> Vec<u32> {
-        if self.is_lambda {
-            // The command itself only waits, and prints the status once a second.
-            descendants(self.started.pid(), "")
-        } else {
-            vec![self.started.pid()]
+    /// Measures for `time`, and adds the costs, the answers and active cooling to a turn.
+    fn measure(
+        &self,
+        time: Duration,
+        conditions: &TurnConditions<'_>,
+        reads_memory: bool,
+        turn: &mut Turn,
+    ) {
+        let (clock, cpu_before) = (Clock::new(0), self.cpu_ns());
+        let began_ns = clock.now();
+        let mut looks = 0;
+        let energy = conditions.meter.watch(time, |elapsed| {
+            let due = LOOK_INTERVAL * looks;
+            if elapsed < due {
+                return;
+            }
+            looks += 1;
+            let state = Throttling::now();
+            turn.invalid.extend(state.since(&state));
+            if reads_memory {
+                turn.memory.push([due.as_secs_f64(), self.memory_mb()]);
+            }
+        });
+        let cpu_ns = used(&cpu_before, &self.cpu_ns());
+        let (ended_ns, after) = (clock.now(), Throttling::now());
+        turn.invalid.extend(after.since(&after));
+        turn.answers.extend(conditions.answers.take());
+        let answers = turn.answers.iter();
+        let in_span = answers.filter(|it| (began_ns..ended_ns).contains(&it.arrived_ns));
+        let (span_s, wakes) = ((ended_ns - began_ns) as f64 / 1e9, in_span.count());
+        let last_mb = turn.memory.last().map(|[_, mb]| *mb);
+        for (name, value) in [
+            ("CPU, % of a core", cpu_ns.map(|cpu_ns| cpu_ns as f64 / 1e7 / span_s)),
+            ("memory (PSS), MB", last_mb.filter(|mb| mb.is_finite())),
+            ("temperature, °C", after.temperature),
+            ("clock, MHz", after.clock_mhz),
+        ] {
+            turn.costs.extend(value.map(|value| (name.to_owned(), value)));
         }
+        let power = energy.iter().flat_map(|part| power(part, conditions.idle, span_s, wakes));
+        turn.costs.extend(power);
+        turn.absent.extend(cpu_ns.is_none().then_some(NO_CPU));
+        turn.absent.extend(last_mb.is_some_and(f64::is_nan).then_some(NO_MEMORY));
     }
 
-    fn cpu_ns(&self) -> u64 {
-        self.processes().into_iter().map(cpu_ns).sum()
+    /// Returns all its processes, with the command; none if those of a lambda cannot be listed.
+    fn processes(&self) -> Vec<u32> {
+        let mut processes = vec![self.started.pid()];
+        if self.is_lambda {
+            processes.extend(descendants(self.started.pid(), ""));
+        }
+        if self.is_lambda && processes.len() == 1 { Vec::new() } else { processes }
+    }
+
+    /// Returns the CPU time of each process so far.
+    fn cpu_ns(&self) -> BTreeMap<u32, u64> {
+        self.processes().into_iter().map(|pid| (pid, cpu_ns(pid))).collect()
     }
 
     /// NaN if it is unknown.
     fn memory_mb(&self) -> f64 {
-        let mib = self.processes().into_iter().map(pss_mib).sum::<f64>();
-        mib * f64::from(1 << 20) / 1e6
+        let mib = self.processes().into_iter().map(pss_mib).reduce(|sum, mib| sum + mib);
+        mib.map_or(f64::NAN, |mib| mib * f64::from(1 << 20) / 1e6)
     }
+}
+
+/// Returns the CPU time between two readings; `None` if it was not counted, or not of all processes.
+fn used(before: &BTreeMap<u32, u64>, after: &BTreeMap<u32, u64>) -> Option<u64> {
+    let each = before.iter().map(|(pid, before)| after.get(pid)?.checked_sub(*before));
+    let used = each.sum::<Option<u64>>()?;
+    (before.len() == after.len() && used > 0).then_some(used)
 }
 
 /// Returns the power of a part of the machine and, where it was measured while nothing ran, what is

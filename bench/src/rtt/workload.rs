@@ -158,7 +158,7 @@ impl Workload {
     /// Returns all sides. `buffer` is the limit of socket buffers. With `real_time`, there are
     /// lambdas that receive with real-time priority, too.
     pub(super) fn sides(self, buffer: u64, real_time: bool) -> Vec<Side> {
-        let lambda = |kind, mode| Side::Lambda(LambdaSide { kind, mode, last: None });
+        let lambda = |kind, mode| Side::Lambda(LambdaSide { kind, mode });
         let node = |kind, depth| Side::Node(NodeSide { kind, depth, buffer });
         let usual = NodeSide::DEPTH;
         let mut sides = vec![node(NodeKind::Bare, usual)];
