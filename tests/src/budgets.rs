@@ -9,7 +9,7 @@
 pub const LINES: &[(&str, usize, usize)] = &[
     ("artifacts", 537, 284),
     ("base", 1669, 983),
-    ("bench", 11747, 745),
+    ("bench", 13249, 1380),
     ("cli", 11187, 4451),
     ("cloud", 16723, 5412),
     ("examples", 1314, 757),
@@ -24,13 +24,13 @@ pub const LINES: &[(&str, usize, usize)] = &[
     ("pixels", 2436, 1553),
     ("player", 2229, 793),
     ("protocol", 10023, 2772),
-    ("report", 2687, 916),
+    ("report", 2617, 905),
     ("rules", 2620, 1179),
     ("spool", 1880, 1129),
     ("test-support", 1612, 211),
     ("tests", 6047, 12730),
     ("trust", 2700, 1174),
-    ("xtask", 6109, 679),
+    ("xtask", 6121, 679),
 ];
 
 /// Crates but for lambdas, examples and benches.
@@ -42,4 +42,4 @@ pub const LONG_FUNCTIONS: &[&str] =
 
 /// Crates whose top-level modules use each other in a circle: folder of the crate, and number of
 /// pairs of modules of which one uses the other and is, over any others, used by it.
-pub const CIRCLES: &[(&str, usize)] = &[("bench/results", 3)];
+pub const CIRCLES: &[(&str, usize)] = &[];
