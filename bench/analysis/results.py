@@ -46,7 +46,7 @@ class Measurement:
 
     @property
     def is_met(self) -> bool | None:
-        """Whether the median keeps the goal, which an unmeasured one does not; None without."""
+        """True if the median keeps the goal, which an unmeasured one does not; None without a goal."""
         if self.goal is None:
             return None
         if self.measured is None:

@@ -137,7 +137,7 @@ class Difference:
 
     @property
     def is_seen(self) -> bool:
-        """Whether the interval excludes 1, which means no difference."""
+        """True if the interval excludes 1, which means no difference."""
         return self.interval is not None and not self.interval[0] <= 1.0 <= self.interval[1]
 
 

@@ -1,6 +1,6 @@
-//! The energy that the machine takes, where it has sensors: energy counters of x86 processors (RAPL,
-//! which only root may read on most systems), and the sensors of the rails of a Jetson (INA3221).
-//! It is never estimated.
+//! The energy that the machine takes, where it has sensors: energy counters of x86 processors
+//! (RAPL, which only root may read on most systems), and the sensors of the rails of a Jetson
+//! (INA3221). It is never estimated.
 
 use std::path::PathBuf;
 use std::thread::sleep;

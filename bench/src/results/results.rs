@@ -134,8 +134,8 @@ impl BenchResults {
         }
     }
 
-    /// Returns the facts of the machine, and of what is measured, that differ from those of an earlier
-    /// part of the run; its load and the time may.
+    /// Returns the facts of the machine, and of what is measured, that differ from those of an
+    /// earlier part of the run; its load and the time may.
     pub fn changed_facts(&self, earlier: &Self) -> Vec<String> {
         let facts = |results: &Self| {
             let facts = results.machine.facts.clone().into_iter();
@@ -153,8 +153,8 @@ impl BenchResults {
             .collect()
     }
 
-    /// Writes `results.json` into `folder`, which it creates. Values that are not numbers, for which
-    /// JSON has no form, are left out.
+    /// Writes `results.json` into `folder`, which it creates. Values that are not numbers, for
+    /// which JSON has no form, are left out.
     ///
     /// # Errors
     ///

@@ -1,4 +1,4 @@
-//! Whether the machine slows its cores down, since they are hot or take too much power: what was
+//! Signs that the machine slows its cores down, since they are hot or take too much power: what was
 //! measured meanwhile is invalid.
 
 use std::collections::BTreeMap;

@@ -27,12 +27,8 @@ pub(super) fn compare<'a>(
         }
     }
     if !left_out.is_empty() {
-        let left_out = left_out.join("; ");
-        let why = "samples were lost or skipped";
-        note(
-            results,
-            format!("{group}: decisions of these are not compared, as {why}: {left_out}."),
-        );
+        let why = "not each sample has an answer, so these turns are not compared";
+        note(results, format!("{group}: decisions: {why}: {}.", left_out.join("; ")));
     }
     let [mut compared, mut differing, mut with_trigger] = [0; 3];
     if let Some((expected, others)) = kept.split_first() {

@@ -24,10 +24,8 @@ use crate::measure::{Twin, pss_mib};
 /// meanwhile, for less than 1 in 1,000 samples of an IMU at 100 Hz.
 const LOOK_INTERVAL: Duration = Duration::from_secs(4);
 
-const NO_CPU: &str = "CPU is not measured: a process started or ended in the measured time, or \
-                      `/proc` has no `children` or no `schedstat`.";
-const NO_MEMORY: &str = "memory is not measured: `/proc` has no `children`, or no `smaps_rollup` \
-                         that can be read.";
+const NO_CPU: &str = "CPU: skipped: a process started or ended, or its time cannot be read";
+const NO_MEMORY: &str = "memory: skipped: the processes or their `smaps_rollup` cannot be read";
 
 pub(super) enum Side {
     /// A lambda in `gleaner run`.
@@ -246,8 +244,8 @@ impl Side {
         }
     }
 
-    /// Adds the times of the stages of a lambda, in its last turn. Goals are for small samples, as an
-    /// image is copied into its slot on the way, and for a valid series.
+    /// Adds the times of the stages of a lambda, in its last turn. Goals are for small samples, as
+    /// an image is copied into its slot on the way, and for a valid series.
     pub(super) fn stages(
         &self,
         workload: Workload,
@@ -364,7 +362,7 @@ impl RunningSide {
     }
 }
 
-/// Returns the CPU time between two readings; `None` if it was not counted, or not of all processes.
+/// Returns the CPU time between two readings; `None` if it was not counted, or not of each process.
 fn used(before: &BTreeMap<u32, u64>, after: &BTreeMap<u32, u64>) -> Option<u64> {
     let each = before.iter().map(|(pid, before)| after.get(pid)?.checked_sub(*before));
     let used = each.sum::<Option<u64>>()?;
