@@ -246,7 +246,11 @@ fn suites(checkout: &Checkout) -> Vec<Suite> {
         pytest(checkout, "Python SDK", &["guest-sdk-python/tests"]),
         pytest(checkout, "fleet client", &["fleet-client-python/tests"]),
         // As users test lambdas, with the SDK of this checkout.
-        pytest(checkout, "examples, notebooks and baselines", &["examples", "bench/baselines", "bench/analysis"]),
+        pytest(
+            checkout,
+            "examples, notebooks and baselines",
+            &["examples", "bench/baselines", "bench/analysis"],
+        ),
     ]);
     suites.extend(typed(checkout).into_iter().map(|file| {
         let mut mypy = checkout.command(checkout.python());
