@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import textwrap
-from pathlib import Path
-from typing import Any, Sequence
+from typing import Any, Iterator, Sequence
 
 import matplotlib
 import numpy as np
@@ -62,38 +62,40 @@ def plain(text: str, width: int = 200) -> str:
     return "\n".join(lines).replace("$", r"\$")
 
 
-def draw_all(report: Report, folder: Path) -> dict[str, list[str]]:
-    """Writes all figures of the report; returns the names of those of each section by its slug,
-    and of the summary by an empty one."""
+def draw_all(report: Report) -> Iterator[tuple[str, str, dict[str, bytes]]]:
+    """Draws all figures of the report: for each the slug of its section, its name, and its files
+    by their ending. Figures of the summary have an empty slug, or one that no section has."""
     looks = styles(report.side_names())
     is_quick = report.results.is_quick
-    drawn: dict[str, list[str]] = {"": []}
-    folder.mkdir(parents=True, exist_ok=True)
-
-    def save(slug: str, name: str, figure: Figure) -> None:
-        for kind, metadata in METADATA.items():
-            figure.savefig(folder / f"{name}.{kind}", format=kind, metadata=metadata)
-        drawn.setdefault(slug, []).append(name)
-
     with matplotlib.rc_context(SETTINGS):
         shown = [(one, [side for side in one.sides if _has_bar(side)]) for one in report.groups]
         shown = [(one, sides) for one, sides in shown if sides]
         for first in range(0, len(shown), MAX_PANELS):
             name = "summary" if first == 0 else f"summary-{first // MAX_PANELS + 1}"
             panels = shown[first : first + MAX_PANELS]
-            save("both columns", name, _summary(panels, looks, is_quick))
+            yield "both columns", name, _files(_summary(panels, looks, is_quick))
         for one, sides in shown:
-            save("", f"{one.slug}-bars", _summary([(one, sides)], looks, is_quick))
+            yield "", f"{one.slug}-bars", _files(_summary([(one, sides)], looks, is_quick))
         for one in report.groups:
             plotted = [side for side in one.sides if side.has_plot]
             title = smoke_title(one.group.name, is_quick)
             if plotted:
-                save(one.slug, f"{one.slug}-ecdf", _ecdf(title, one.unit, plotted, looks))
-                save(one.slug, f"{one.slug}-box", _boxes(title, one.unit, plotted, looks))
+                ecdf = _ecdf(title, one.unit, plotted, looks)
+                yield one.slug, f"{one.slug}-ecdf", _files(ecdf)
+                yield one.slug, f"{one.slug}-box", _files(_boxes(title, one.unit, plotted, looks))
         for growth in report.growths:
             if any(curve.points for curve in growth.growth.curves):
-                save(growth.slug, f"{growth.slug}-curves", _curves(growth, looks, is_quick))
-    return drawn
+                curves = _curves(growth, looks, is_quick)
+                yield growth.slug, f"{growth.slug}-curves", _files(curves)
+
+
+def _files(figure: Figure) -> dict[str, bytes]:
+    found = {}
+    for kind, metadata in METADATA.items():
+        content = io.BytesIO()
+        figure.savefig(content, format=kind, metadata=metadata)
+        found[kind] = content.getvalue()
+    return found
 
 
 def _has_bar(side: Side) -> bool:

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from typing import Iterator, Sequence
 
-from report import GroupReport, Report, cost_names
+from report import INCOMPLETE, GroupReport, Report, cost_names
 from styles import styles
-from tables import SMOKE_TEST, micro, to_csv, to_latex, to_markdown
+from tables import SMOKE_TEST, markdown_text, micro, to_csv, to_latex, to_markdown
 
 
 def markdown(report: Report) -> str:
     """The text of results.md."""
     results = report.results
-    parts = [f"# {report.title}\n"]
+    parts = [f"# {markdown_text(report.title)}\n"]
+    if not results.is_complete:
+        parts.append(f"{INCOMPLETE}\n")
     if report.goals:
         parts.append(f"{report.goals}\n")
     if report.headline:
@@ -25,10 +27,14 @@ def markdown(report: Report) -> str:
     if report.measurements:
         parts.append("## Measurements\n\n" + to_markdown(report.measurements).split("\n\n", 1)[1])
     if results.notes:
-        parts.append("## Notes\n\n" + "".join(f"- {note}\n" for note in results.notes))
-    facts = "".join(f"- {name}: {value}\n" for name, value in results.machine.facts.items())
-    parts.append(f"## Machine\n\n{facts}")
+        parts.append("## Notes\n\n" + _list(results.notes))
+    facts = [f"{name}: {value}" for name, value in results.machine.facts.items()]
+    parts.append("## Machine\n\n" + _list(facts))
     return "\n".join(parts)
+
+
+def _list(texts: Sequence[str]) -> str:
+    return "".join(f"- {markdown_text(text)}\n" for text in texts)
 
 
 def table_files(report: Report) -> Iterator[tuple[str, str]]:
@@ -66,10 +72,11 @@ def _csv_tables(report: Report) -> Iterator[tuple[str, list[str], Sequence[tuple
     differences = [
         (group.group.name, base, side, group.unit, *found.medians, found.ratio)
         + (*(found.interval or (None, None)), found.delta, found.p)
+        + (" ".join(map(str, found.turn_ratios)),)
         for group in report.groups
         for (base, side), found in group.differences.items()
     ]
-    heads += ",cliffs_delta,mann_whitney_p"
+    heads += ",cliffs_delta,mann_whitney_p,ratio_of_each_turn"
     yield "differences.csv", heads.split(","), differences
     points = [
         (one.growth.name, curve.name, one.growth.of, x, micro(one.growth.unit), y)
@@ -79,9 +86,9 @@ def _csv_tables(report: Report) -> Iterator[tuple[str, list[str], Sequence[tuple
     ]
     yield "growths.csv", ["growth", "curve", "of", "x", "unit", "value"], points
     values = [
-        (row.name, micro(row.unit), *map((row.goal or {}).get, ("at_least", "at_most")))
-        + (run + 1, value)
+        (row.name, micro(row.unit), *map(goal.get, ("at_least", "at_most")), run + 1, value)
         for row in report.results.figures
+        for goal in [{} if report.results.is_quick else row.goal or {}]
         for run, value in enumerate(row.values)
     ]
     heads = "measurement,unit,at_least,at_most,run,value"

@@ -5,9 +5,8 @@ from __future__ import annotations
 import base64
 import re
 from html import escape
-from pathlib import Path
 
-from report import Report
+from report import INCOMPLETE, Report
 from styles import Style, styles
 from tables import SMOKE_TEST, Table
 
@@ -63,8 +62,8 @@ dt { color: var(--soft); } dd { margin: 0; overflow-wrap: anywhere; }
 """
 
 
-def to_html(report: Report, figures: Path, drawn: dict[str, list[str]]) -> str:
-    """The page, with the figures `drawn` of each section, which lie in the folder `figures`."""
+def to_html(report: Report, drawn: dict[str, dict[str, bytes]]) -> str:
+    """The page, with the figures of each section: `drawn` has their names and SVG files."""
     looks = styles(report.side_names())
     results = report.results
     facts = results.machine.facts
@@ -72,16 +71,18 @@ def to_html(report: Report, figures: Path, drawn: dict[str, list[str]]) -> str:
     parts = [f"<h1>{escape(report.title)}</h1>", f'<p class="soft">{escape(origin)}</p>']
     if results.is_quick:
         parts.append(f'<p class="mark">This is a {SMOKE_TEST}: its values are not meaningful.</p>')
+    if not results.is_complete:
+        parts.append(f'<p class="mark">{INCOMPLETE}</p>')
     if report.goals:
         parts.append(f'<p>{escape(report.goals)} See <a href="#measurements">all goals</a>.</p>')
     if report.headline:
         links = {row[0]: one.slug for one in report.groups for row in report.headline.rows
                  if row[0] == f"{one.group.name}, {one.unit}"}
-        parts += [_table(report.headline, looks, links), _cards(figures, drawn.get("", []))]
+        parts += [_table(report.headline, looks, links), _cards(drawn.get("", {}))]
     for section in report.sections():
         first, *others = section.tables
         parts.append(f'<h2 id="{section.slug}">{escape(first.title)}</h2>')
-        parts.append(_cards(figures, drawn.get(section.slug, [])))
+        parts.append(_cards(drawn.get(section.slug, {})))
         parts.append(_table(first, looks, {}, has_title=False))
         parts += [_table(table, looks, {}) for table in others]
     if report.measurements:
@@ -102,11 +103,11 @@ def to_html(report: Report, figures: Path, drawn: dict[str, list[str]]) -> str:
     )
 
 
-def _cards(figures: Path, names: list[str]) -> str:
+def _cards(figures: dict[str, bytes]) -> str:
     images = []
-    for name in names:
+    for name, content in figures.items():
         # An image has no scripts, and its identifiers do not meet those of other images.
-        data = base64.b64encode((figures / f"{name}.svg").read_bytes()).decode()
+        data = base64.b64encode(content).decode()
         images.append(f'<img alt="{escape(name)}" src="data:image/svg+xml;base64,{data}">')
     return f'<div class="cards">{"".join(images)}</div>' if images else ""
 

@@ -15,6 +15,7 @@ from tables import COMPARED, SMOKE_TEST, Table, difference_cells, goal_number, m
 STATISTICS = ("min", "mean", "median", "MAD", "p95", "p99", "max")
 # Sides of the summary. Each is a column, and a reader compares a few.
 MAX_COLUMNS = 10
+INCOMPLETE = "The measurement is not complete: workloads or rows are missing."
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,8 @@ def make_report(results: Results) -> Report:
     return Report(
         results=results,
         title=f"Gleaner bench: {results.bench}"
-        + (" (smoke test: values are not meaningful)" if quick else ""),
+        + (" (smoke test: values are not meaningful)" if quick else "")
+        + ("" if results.is_complete else " (incomplete)"),
         headline=headline.marked(quick) if headline else None,
         goals=_goals(results),
         groups=groups,
@@ -121,7 +123,7 @@ def _slugs(names: Sequence[str]) -> list[str]:
 
 
 def _group_report(group: Group, slug: str) -> GroupReport:
-    samples = [(series, Sample(series.values)) for series in group.series]
+    samples = [(series, Sample(series.values, series.turns)) for series in group.series]
     sides = [Side(series, sample, sample.summary()) for series, sample in samples]
     compared = {side.name: side for side in sides if side.is_compared}
     differences = {}
@@ -156,9 +158,12 @@ def _group_tables(report: GroupReport) -> list[Table]:
     for base in report.group.bases:
         found = {side: one for (of, side), one in report.differences.items() if of == base}
         if found:
-            rows = [[side, *difference_cells(one)] for side, one in found.items()]
+            rows = [
+                [side, *difference_cells(one), ", ".join(map(number, one.turn_ratios)) or "-"]
+                for side, one in found.items()
+            ]
             caveat = [CAVEAT] if any(one.p is not None for one in found.values()) else []
-            heads = ["side", *COMPARED]
+            heads = ["side", *COMPARED, "ratio of each turn"]
             tables.append(Table(f"Against {base}", heads, rows, caveat, list(found)))
     details = list(dict.fromkeys(name for side in sides for name in side.series.details))
     if details:
@@ -250,11 +255,15 @@ def _growth_tables(growth: Growth) -> list[Table]:
 
 
 def _measurements(rows: Sequence[Measurement], is_quick: bool) -> Table:
-    heads = ["measurement", "goal", "median", "spread", "runs"] + ([] if is_quick else ["result"])
-    return Table("Measurements", heads, [_measurement_row(row, is_quick) for row in rows])
+    heads = ["measurement", "goal", "median", "spread", "runs", "result"]
+    cells = [_measurement_row(row) for row in rows]
+    if is_quick:
+        # A smoke test has no goals.
+        heads, cells = [heads[0], *heads[2:5]], [[row[0], *row[2:5]] for row in cells]
+    return Table("Measurements", heads, cells)
 
 
-def _measurement_row(row: Measurement, is_quick: bool) -> list[str]:
+def _measurement_row(row: Measurement) -> list[str]:
     unit, goal = micro(row.unit), "-"
     for kind, bound in (row.goal or {}).items():
         sign = "<=" if kind == "at_most" else ">="
@@ -267,13 +276,14 @@ def _measurement_row(row: Measurement, is_quick: bool) -> list[str]:
         texts = [f"{value:.10g}" if is_count else number(value) for value in found]
         median, spread = f"{texts[0]} {unit}".strip(), f"{texts[1]} to {texts[2]}"
     result = {True: "met", False: "not met", None: "-"}[row.is_met]
-    return [row.name, goal, median, spread, str(len(row.values)), *([] if is_quick else [result])]
+    return [row.name, goal, median, spread, str(len(row.values)), result]
 
 
 def _goals(results: Results) -> str:
-    """A sentence about the goals; empty without any, or in a quick run."""
+    """A sentence about the goals; empty without any, or in a quick or incomplete run."""
     met = [row.is_met for row in results.figures if row.is_met is not None]
-    return f"{sum(met)} of {len(met)} goals are met." if met and not results.is_quick else ""
+    is_meaningful = met and results.is_complete and not results.is_quick
+    return f"{sum(met)} of {len(met)} goals are met." if is_meaningful else ""
 
 
 def smoke_title(title: str, is_quick: bool) -> str:

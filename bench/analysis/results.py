@@ -5,14 +5,20 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import re
 import statistics
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NoReturn, get_args, get_origin, get_type_hints
 
 FORMAT = 2
 FILE = "results.json"
+# Larger numbers are errors: sums of their squares would be infinite.
+MAX_NUMBER = 1e100
+# Control characters and halves of a pair of UTF-16 have no meaning in a file of texts.
+NO_TEXT = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]+")
+# Facts in which runs of one result should agree.
+SAME_FACTS = ("revision", "kernel", "processor")
 
 
 class InputError(Exception):
@@ -46,7 +52,7 @@ class Measurement:
 
     @property
     def is_met(self) -> bool | None:
-        """True if the median keeps the goal, which an unmeasured one does not; None without a goal."""
+        """True if the median keeps the goal, which an unmeasured one does not; None without one."""
         if self.goal is None:
             return None
         if self.measured is None:
@@ -66,15 +72,22 @@ class Reception:
 
 @dataclass(frozen=True)
 class Series:
-    """Measurements of one side, in the order in which they were made. Costs have a value for each
-    turn; `invalid` has the reasons why the values mean nothing."""
+    """Measurements of one side, in the order in which they were made. `turns` has the number of
+    values of each turn, and is empty for a single one. Costs have a value for each turn; `invalid`
+    has the reasons why the values mean nothing."""
 
     name: str
     details: dict[str, str]
     reception: Reception | None
     values: list[float]
+    turns: list[int]
     costs: dict[str, list[float]]
     invalid: list[str]
+
+    def __post_init__(self) -> None:
+        total, count = sum(self.turns), len(self.values)
+        if self.turns and (total != count or min(self.turns) < 0):
+            raise ValueError(f"the turns of `{self.name}` add up to {total} of its {count} values")
 
 
 @dataclass(frozen=True)
@@ -122,6 +135,7 @@ class Results:
 
     bench: str
     is_quick: bool
+    is_complete: bool
     machine: Machine
     figures: list[Measurement]
     groups: list[Group]
@@ -148,24 +162,29 @@ def _build(kind: Any, value: Any, place: str) -> Any:
         return kind(**values)  # type: ignore[operator]
     if get_origin(kind) is dict:
         items = _checked(value, dict, "an object", place).items()
-        return {name: _build(parts[1], one, f"{place}.{name}") for name, one in items}
+        return {_text(key): _build(parts[1], one, f"{place}.{key}") for key, one in items}
     if get_origin(kind) is list:
+        _checked(value, list, "a list", place)
         # Each value of a long series by itself would take most of the time of a run.
-        if kind == list[float] and all(type(one) is float for one in value or ()):
-            if all(map(math.isfinite, value or ())):
-                return _checked(value, list, "a list", place)
-        every = enumerate(_checked(value, list, "a list", place))
-        return [_build(parts[0], one, f"{place}[{at}]") for at, one in every]
+        if kind == list[float] and all(type(one) is float for one in value):
+            if max(map(abs, value), default=0.0) <= MAX_NUMBER:
+                return value
+        return [_build(parts[0], one, f"{place}[{at}]") for at, one in enumerate(value)]
     if get_origin(kind) is tuple:
         if len(_checked(value, list, "a list", place)) != len(parts):
             raise ValueError(f"`{place}` should be {len(parts)} numbers")
         return tuple(_build(part, one, place) for part, one in zip(parts, value))
     if kind is float:
         number = _checked(value, (int, float), "a number", place)
-        if abs(number) > sys.float_info.max:
-            raise ValueError(f"`{place}` should be a finite number")
+        if abs(number) > MAX_NUMBER:
+            raise ValueError(f"`{place}` should be a finite number of at most {MAX_NUMBER:g}")
         return float(number)
-    return _checked(value, kind, _NAMES[kind], place)
+    _checked(value, kind, _NAMES[kind], place)
+    return _text(value) if kind is str else value
+
+
+def _text(value: str) -> str:
+    return NO_TEXT.sub(" ", value)
 
 
 def _checked(value: Any, kind: Any, name: str, place: str) -> Any:
@@ -202,7 +221,8 @@ def load_file(path: Path) -> Results:
 def load(path: Path) -> Results:
     """Reads the results in a file or a folder. A folder with a folder for each of several runs has
     one value for each run, its median, in the order of their names: values of a run are not
-    independent of each other, as the speed of the machine differs between runs.
+    independent of each other, as the speed of the machine differs between runs. Its notes are only
+    about how the runs were merged.
 
     Raises InputError as `load_file`, and for runs of different benchmarks."""
     own = path / FILE
@@ -210,9 +230,9 @@ def load(path: Path) -> Results:
     if not runs and path.is_dir():
         runs = sorted(run / FILE for run in path.iterdir() if (run / FILE).is_file())
     if not runs:
-        return load_file(own if path.is_dir() else path)
+        runs = [own if path.is_dir() else path]
     if len(runs) == 1:
-        return load_file(runs[0])
+        return replace(load_file(runs[0]), notes=[])
     loaded = [load_file(run) for run in runs]
     first = loaded[0]
     for run, other in zip(runs, loaded):
@@ -222,34 +242,47 @@ def load(path: Path) -> Results:
                 f"it has {_kind(other)}, the first one {_kind(first)}",
                 "compare runs of one benchmark, all of them quick or none",
             )
-    return _merge(loaded)
+    return _merge({run.parent.name: one for run, one in zip(runs, loaded)})
 
 
 def _kind(results: Results) -> str:
     return f"the benchmark `{results.bench}`" + (" with --quick" if results.is_quick else "")
 
 
-def _merge(runs: list[Results]) -> Results:
+def _merge(runs: dict[str, Results]) -> Results:
     figures: dict[tuple[str, str], Measurement] = {}
     groups: dict[tuple[str, str], Group] = {}
-    for run in runs:
+    for folder, run in runs.items():
         for row in run.figures:
             known = figures.setdefault((row.name, row.unit), replace(row, values=[]))
             known.values.append(None if row.measured is None else statistics.median(row.measured))
         for group in run.groups:
             own = groups.setdefault((group.name, group.unit), replace(group, series=[]))
             for series in group.series:
-                _add_run(own, series)
-    return replace(runs[0], figures=list(figures.values()), groups=list(groups.values()))
+                _add_run(own, series, folder)
+    notes = []
+    for fact in SAME_FACTS:
+        found = dict.fromkeys(run.machine.facts.get(fact, "unknown") for run in runs.values())
+        if len(found) > 1:
+            notes.append(f"the runs differ: {fact}: {', '.join(found)}")
+    for group in groups.values():
+        for one in group.series:
+            if one.values and one.invalid:
+                # The other runs are valid: the series is, too.
+                notes.append(f"left out: {group.name}: {one.name}: {'; '.join(one.invalid)}")
+                one.invalid.clear()
+    is_complete = all(run.is_complete for run in runs.values())
+    return replace(next(iter(runs.values())), is_complete=is_complete, notes=notes,
+                   figures=list(figures.values()), groups=list(groups.values()))
 
 
-def _add_run(group: Group, series: Series) -> None:
-    """Adds the median of another run. An invalid run adds its reasons and no value."""
+def _add_run(group: Group, series: Series, folder: str) -> None:
+    """Adds the median of the run in `folder`. An invalid run adds its reasons and no value."""
     known = next((one for one in group.series if one.name == series.name), None)
     if known is None:
-        known = replace(series, reception=None, values=[], costs={}, invalid=[])
+        known = replace(series, reception=None, values=[], turns=[], costs={}, invalid=[])
         group.series.append(known)
     if series.invalid:
-        known.invalid.extend(series.invalid)
+        known.invalid.extend(f"run `{folder}`: {reason}" for reason in series.invalid)
     elif series.values:
         known.values.append(statistics.median(series.values))

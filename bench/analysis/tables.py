@@ -74,7 +74,7 @@ def difference_cells(found: Difference) -> list[str]:
     return [ratio, interval_text(found.interval), f"{found.delta:+.2f}", p]
 
 
-def _markdown_text(text: str) -> str:
+def markdown_text(text: str) -> str:
     text = re.sub(r"\s+", " ", text).replace("|", "\\|")
     return re.sub(r"<(?=[A-Za-z/!?])", r"\\<", text)
 
@@ -82,13 +82,13 @@ def _markdown_text(text: str) -> str:
 def markdown_rows(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """The table as Markdown, with a line for each row."""
     lines = [heads, ["---"] * len(heads), *rows]
-    return "".join(f"| {' | '.join(map(_markdown_text, line))} |\n" for line in lines)
+    return "".join(f"| {' | '.join(map(markdown_text, line))} |\n" for line in lines)
 
 
 def to_markdown(table: Table) -> str:
     """The table as Markdown, below its title."""
-    title = f"{_markdown_text(table.title)}:\n\n" if table.title else ""
-    notes = "".join(f"\n{_markdown_text(note)}\n" for note in table.notes)
+    title = f"{markdown_text(table.title)}:\n\n" if table.title else ""
+    notes = "".join(f"\n{markdown_text(note)}\n" for note in table.notes)
     return f"{title}{markdown_rows(table.heads, table.rows)}{notes}"
 
 
@@ -145,9 +145,16 @@ def to_latex(table: Table, label: str, caption: str) -> str:
 
 
 def to_csv(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Rows with all digits of their numbers; None is an empty cell."""
+    """Rows with all digits of their numbers; None is an empty cell. A text that a spreadsheet
+    would take as a formula begins with an apostrophe."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(heads)
-    writer.writerows(rows)
+    writer.writerows([_csv_cell(cell) for cell in row] for row in rows)
     return text.getvalue()
+
+
+def _csv_cell(cell: object) -> object:
+    # A text of signs only, such as a hatch, computes nothing.
+    is_formula = isinstance(cell, str) and re.match(r"[=+\-@\t\r].*\w", cell, re.DOTALL)
+    return f"'{cell}" if is_formula else cell

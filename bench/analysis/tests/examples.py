@@ -24,7 +24,8 @@ HOSTILE = "a|b <x> & _%"
 
 def series(name: str, values: Any, **more: Any) -> dict[str, Any]:
     values = [float(value) for value in values]
-    empty: dict[str, Any] = {"details": {}, "reception": None, "costs": {}, "invalid": []}
+    empty: dict[str, Any] = {"details": {}, "reception": None, "turns": [], "costs": {},
+                             "invalid": []}
     return {"name": name, "values": values, **empty, **more}
 
 
@@ -35,8 +36,8 @@ def group(name: str, bases: list[str], *all_series: dict[str, Any]) -> dict[str,
 def results(**more: Any) -> dict[str, Any]:
     facts = {"processor": "AMD EPYC <x>", "kernel": "6.18.44", "measured": "2026-12-01 00:10 UTC"}
     empty: dict[str, Any] = {"figures": [], "groups": [], "growths": [], "notes": []}
-    return {"format": 2, "bench": "rtt", "is_quick": False, "machine": {"facts": facts}, **empty,
-            **more}
+    return {"format": 2, "bench": "rtt", "is_quick": False, "is_complete": True,
+            "machine": {"facts": facts}, **empty, **more}
 
 
 def rtt(seed: int = 1, count: int = 6000, is_quick: bool = False) -> dict[str, Any]:
@@ -54,6 +55,7 @@ def rtt(seed: int = 1, count: int = 6000, is_quick: bool = False) -> dict[str, A
                  "power above idle, VDD_IN, W": 0.11 * cpu * turn,
                  "energy per wake above idle, VDD_IN, mJ": 1.1 * cpu * turn}
         return series(name, values, reception={"sent": count + 1, "answered": count},
+                      turns=[count // 3, count // 3, count - 2 * (count // 3)],
                       details={"stack": "RustDDS <1>", "socket buffer, B": "425984"},
                       costs={key: list(cost) for key, cost in costs.items()})
 
@@ -66,7 +68,7 @@ def rtt(seed: int = 1, count: int = 6000, is_quick: bool = False) -> dict[str, A
     groups[1]["series"][2]["invalid"] = ["turn 2: the processor was throttled 3 times"]
     groups[2]["series"] = groups[2]["series"][:4]
     for one in groups[2]["series"]:
-        one["values"] = one["values"][:40]
+        one["values"], one["turns"] = one["values"][:40], []
     few = group("few values", ["rclpy"], series("rclpy", [1.0]), series("lambda, wasm", []),
                 series(HOSTILE, [1.0, 2.0, 2.5]))
     growths = [{"name": f"{names[0]}: memory (PSS) in the last turn", "of": "seconds", "unit": "MB",

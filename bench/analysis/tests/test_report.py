@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from page import to_html
 from report import Report, make_report
 from results import load_file
 from styles import styles
-from tables import number
+from tables import number, to_csv
 
 PROGRAM = Path(__file__).parent.parent
 
@@ -78,7 +79,10 @@ def test_a_smoke_test_is_marked_in_every_row_and_meets_no_goal(tmp_path: Path) -
     assert all(row.endswith(("| smoke test |", "| status |")) for row in rows)
     titles = re.findall(r"^(?:## )?(IMU.*in ms.*|Against.*|Medians.*)$", text, re.M)
     assert len(titles) > 5 and all("(smoke test)" in title for title in titles)
-    assert not re.search(r"goals|\| (not )?met", text) and "< 0.001" not in text
+    assert not re.search(r"goal|\| (not )?met", text) and "< 0.001" not in text
+    files = dict(table_files(one))
+    assert not re.search("goal|20 ", files["all_measurements.tex"])
+    assert '"wake, p50",µs,,,1,18.0,smoke test' in files["measurements.csv"]
     assert "too few values | too few values | too few values |" in text
     assert all(found.p is None and found.delta is None and found.interval is None
                for each in one.groups for found in each.differences.values())
@@ -103,11 +107,48 @@ class Texts(HTMLParser):
             self.cells[-1] += data
 
 
+def test_results_that_are_not_complete_say_so(tmp_path: Path) -> None:
+    one = report(tmp_path, {**rtt(count=30), "is_complete": False})
+    text, page = markdown(one), to_html(one, {})
+    assert text.startswith("# Gleaner bench: rtt (incomplete)\n\nThe measurement is not complete")
+    assert page.count("(incomplete)</") == 2 and '<p class="mark">The measurement is not' in page
+    assert "goals are met" not in text and "goals are met" not in page
+
+
+def test_differences_have_the_ratio_of_each_turn(tmp_path: Path) -> None:
+    sides = [series("rclpy", [1, 1, 2, 2, 4, 4], turns=[2, 2, 2]),
+             series("wasm", [2, 2, 2, 2, 2, 2], turns=[2, 2, 2]), series("bare", range(1, 7))]
+    one = report(tmp_path, results(groups=[group("g", ["rclpy"], *sides)]))
+    text = markdown(one)
+    assert "turns are drawn first, then blocks of up to 100 neighbours within them" in text
+    assert "| 2.00, 1.00, 0.500 |\n| bare |" in text and "| ratio of each turn |" in text
+    assert re.search(r"^\| bare \| 1.75 .* - \|$", text, re.M)
+    rows = list(csv.DictReader(dict(table_files(one))["differences.csv"].splitlines()))
+    assert [row["ratio_of_each_turn"] for row in rows] == ["2.0 1.0 0.5", ""]
+
+
+def test_texts_are_neither_formulas_nor_control_codes(tmp_path: Path) -> None:
+    names = ["=1+1", "+x", "-x", "@x", "\ta", "\rb", "\ud800c", "-"]
+    sides = [series(name, [-1.0]) for name in names]
+    content = results(bench="a\n|b <x>", notes=["one\ntwo <b> \x1b[0m"],
+                      groups=[group("g", [], *sides)])
+    content["machine"]["facts"]["board\n\udfff"] = "a|b\r\nc"
+    one = report(tmp_path, content)
+    rows = list(csv.DictReader(dict(table_files(one))["statistics.csv"].splitlines()))
+    assert [row["side"] for row in rows] == ["'=1+1", "'+x", "'-x", "'@x", " a", " b", " c", "-"]
+    assert to_csv(["a", "b"], [["\tx", -1.0], ["@x", "----"]]) == "a,b\n'\tx,-1.0\n'@x,----\n"
+    assert {row["min"] for row in rows} == {"-1.0"}
+    text = markdown(one)
+    assert text.startswith("# Gleaner bench: a \\|b \\<x>\n")
+    assert "\n- one two \\<b> [0m\n" in text and "\n- board : a\\|b c\n" in text
+    text.encode()
+
+
 def test_hostile_names_stay_texts(tmp_path: Path) -> None:
     sides = [series(HOSTILE, range(1, 9)), series("<script>\\$x$", range(2, 9))]
     content = results(groups=[group(HOSTILE, [HOSTILE], *sides)], notes=[HOSTILE])
     one = report(tmp_path, content)
-    page = Texts(to_html(one, tmp_path, {}))
+    page = Texts(to_html(one, {}))
     assert HOSTILE in page.cells and "<script>\\$x$" in page.cells
     assert not page.elements & {"script", "x", "link", "iframe"}
     assert "| a\\|b \\<x> & _% | 8 |" in markdown(one)
@@ -137,8 +178,11 @@ def test_equal_input_makes_equal_files(tmp_path: Path) -> None:
     content = rtt(count=120)
     content["groups"] = content["groups"][1:2] + content["groups"][3:]
     del content["groups"][0]["series"][3:]
-    for name, seed in (("a", "1"), ("b", "2")):
-        done = run("render", "--print", store(tmp_path / name, content), PYTHONHASHSEED=seed)
+    folders = [store(tmp_path / name, content) for name in "ab"]
+    with ThreadPoolExecutor() as pool:
+        both = pool.map(lambda one: run("render", "--print", one[1], PYTHONHASHSEED=one[0]),
+                        zip("12", folders))
+    for name, done in zip("ab", both):
         assert done.returncode == 0 and done.stderr == "", done.stderr
         assert done.stdout == (tmp_path / name / "results.md").read_text()
     files = {
@@ -160,6 +204,33 @@ def test_equal_input_makes_equal_files(tmp_path: Path) -> None:
     assert b"/CreationDate" not in pdf and b"/FontFile2" in pdf and b"/Type3" not in pdf
 
 
+def test_a_render_replaces_the_files_of_an_earlier_one_and_follows_no_link(tmp_path: Path) -> None:
+    sides = [series("\ud800", [1, 1e100]), series("rclpy", [-1e100, 2])]
+    points = [{"name": "c", "points": [[-1e100, -1e100], [1e100, 1e100]]}]
+    growths = [{"name": "w", "of": "s", "unit": "MB", "curves": points}]
+    folder = store(tmp_path / "a", results(groups=[group("g", [], *sides)], growths=growths))
+    outside = tmp_path / "outside"
+    outside.write_text("kept")
+    kept = ["tables/old.txt", "tables/link.csv", "figures/sub.pdf/x"]
+    for name in ("tables/old.csv", "tables/old.tex", "figures/old.svg", "figures/old.pdf", *kept):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).symlink_to(outside) if "link" in name else (folder / name).touch()
+    for name in ("results.md", "tables/costs.csv", "figures/w-curves.svg"):
+        (folder / name).symlink_to(outside)
+    done = run("render", folder)
+    assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
+    assert outside.read_text() == "kept" and (folder / "results.md").is_file()
+    names = {str(path.relative_to(folder)) for path in folder.rglob("*")}
+    assert names >= {*kept, "figures/w-curves.svg"}
+    assert not any(re.search(r"old\.(csv|tex|svg|pdf)|part$", name) for name in names)
+    links = {path.name for path in folder.rglob("*") if path.is_symlink()}
+    assert links == {"link.csv"}
+    (folder / "tables").rename(tmp_path / "tables")
+    (folder / "tables").symlink_to(tmp_path / "tables")
+    done = run("render", folder)
+    assert done.returncode == 2 and "tables`" in done.stderr and "symbolic link" in done.stderr
+
+
 @pytest.mark.parametrize("missing", ["numpy", "matplotlib"])
 def test_a_missing_library_is_named_with_its_package(tmp_path: Path, missing: str) -> None:
     stub = tmp_path / "stubs" / missing
@@ -178,3 +249,5 @@ def test_wrong_input_ends_with_exit_code_2(tmp_path: Path) -> None:
         done = run(*arguments)
         assert done.returncode == 2 and "error: " in done.stderr, done
     assert "  cause: " in run("render", tmp_path).stderr
+    done = run("check-aa", store(tmp_path, rtt(count=30)) / "results.json")
+    assert done.returncode == 1 and "error: nothing to check in" in done.stderr

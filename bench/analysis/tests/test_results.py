@@ -47,6 +47,25 @@ REFUSED = {
         "different names",
     ),
     "deep": ("[" * 100_000, "recursion"),
+    "list": (
+        changed(lambda it: it["groups"][0]["series"][0].update(values=5)),
+        "`groups[0].series[0].values` should be a list",
+    ),
+    "costs": (
+        changed(lambda it: it["groups"][0]["series"][0].update(costs={"a": 5})),
+        "`groups[0].series[0].costs.a` should be a list",
+    ),
+    "too large": (
+        changed(lambda it: it["growths"][0]["curves"][0].update(points=[[-1e308, 1], [1e308, 1]])),
+        "should be a finite number of at most 1e+100",
+    ),
+    "turns": (
+        changed(lambda it: it["groups"][0]["series"][0].update(turns=[2, 2])),
+        "the turns of `bare reader` add up to 4 of its 5 values",
+    ),
+    "negative turn": (
+        changed(lambda it: it["groups"][0]["series"][0].update(turns=[6, -1])), "add up to 5",
+    ),
 }
 
 
@@ -76,8 +95,18 @@ def test_several_runs_have_the_median_of_each_run(tmp_path: Path) -> None:
     assert both.figures[0].values == [19, 19, 19]
     bare, wasm = both.groups[0].series
     assert len(bare.values) == 3 and wasm.values == pytest.approx([1.995, 2.495])
-    assert wasm.invalid == ["throttled"]
+    # One invalid run is left out; the others are valid.
+    left_out = "left out: IMU | 100 Hz: wasm: run `003`: throttled"
+    assert wasm.invalid == [] and both.notes == [left_out] and both.is_complete
+    assert f"- B: {left_out}" in compare(load(tmp_path / "001"), both)
     assert load(tmp_path / "001") == load(tmp_path / "001" / "results.json")
+    for name in ("001", "002"):
+        store(tmp_path / name, {**bad, "is_complete": False})
+    bad["machine"]["facts"] = {"kernel": "6.6", "processor": "AMD EPYC <x>", "board": "x"}
+    store(tmp_path / "003", bad)
+    both = load(tmp_path)
+    assert both.groups[0].series[1].invalid == [f"run `00{n}`: throttled" for n in (1, 2, 3)]
+    assert both.notes == ["the runs differ: kernel: 6.18.44, 6.6"] and not both.is_complete
     store(tmp_path / "004", one(0, is_quick=True))
     with pytest.raises(InputError, match="004"):
         load(tmp_path)
@@ -99,11 +128,28 @@ def test_each_row_of_two_results_has_an_effect_and_a_verdict(tmp_path: Path) -> 
     assert "higher" not in quick and quick.count("| smoke test |") == 3
 
 
+def test_rows_and_facts_of_one_side_are_not_lost(tmp_path: Path) -> None:
+    def lost(value: float | None) -> dict[str, Any]:
+        return {"name": "lost", "unit": "", "goal": {"at_most": 0.0}, "values": [value]}
+
+    a, b = one(0), one(0, is_complete=False)
+    a["figures"].append(lost(0.0))
+    b["figures"] = [{**a["figures"][0], "values": [None]}, lost(5000.0)]
+    a["groups"][0]["series"][0]["values"] = []
+    b["machine"]["facts"]["board"] = "Orin"
+    text = compare(load(store(tmp_path / "a", a)), load(store(tmp_path / "b", b)))
+    for line in ("no values in B: wake", "no values in A: IMU | 100 Hz: bare", "B is not complete",
+                 "lost: 0 in A, 5000 in B", "the machines differ: board: unknown, and Orin"):
+        assert f"- {line}\n" in text
+    assert text.count("no values") == 2 and "A is not" not in text
+
+
 def test_an_invalid_series_is_not_compared(tmp_path: Path) -> None:
     bad = one(0.5)
     bad["groups"][0]["series"][1]["invalid"] = ["throttled"]
     text = compare(load(store(tmp_path / "a", one(0))), load(store(tmp_path / "b", bad)))
     assert "wasm |" not in text and "- invalid in B: IMU | 100 Hz: wasm: throttled" in text
+    assert "no values" not in text
 
 
 def test_a_series_does_not_differ_from_itself(
@@ -113,9 +159,14 @@ def test_a_series_does_not_differ_from_itself(
     monkeypatch.setattr(comparison, "LEAST_EQUAL", 18)
     side = rtt(count=1000)["groups"][0]["series"][0]
     few = series(HOSTILE, [1.0] * 199)
-    text, is_good = check_aa(load(store(tmp_path, results(groups=[group("g", [], side, few)]))))
+    levels = [level + n * 37 % 100 / 100 for level in (1, 1, 3) for n in range(200)]
+    sides = [side, few, series("levels", levels, turns=[200] * 3)]
+    text, is_good = check_aa(load(store(tmp_path, results(groups=[group("g", [], *sides)]))))
     assert is_good and text.startswith("g: bare reader: no difference seen in ")
-    assert text.count("\n") == 1
-    monkeypatch.setattr(comparison, "_is_equal", lambda values, seed: seed > 2)
+    assert text.count("\n") == 4
+    # Turns that differ are stated, and are not an error.
+    assert "g: levels: turn against turn: no difference seen in 1 of 3 pairs\n" in text
+    assert "g: bare reader: turn against turn: no difference seen in 3 of 3 pairs\n" in text
+    monkeypatch.setattr(comparison, "_is_equal", lambda turns, seed: seed > 2)
     text, is_good = check_aa(load(tmp_path))
     assert not is_good and "in 17 of 20, fewer than 18" in text

@@ -78,11 +78,44 @@ def test_neighbours_that_are_alike_widen_an_interval() -> None:
     assert widths[0] > 2 * widths[1]
 
 
+def test_intervals_cover_the_ratio_of_sides_whose_turns_differ(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(stats, "RESAMPLES", 200)
+    random = np.random.RandomState(6)
+    covered = {(): 0, (40,) * 8: 0}
+    for _ in range(40):
+        levels = np.exp(0.1 * random.normal(size=(2, 8, 1)))
+        sides = (levels * random.lognormal(0, 0.1, (2, 8, 40))).reshape(2, -1)
+        for turns in covered:
+            found = difference(*(Sample(side, turns) for side in sides))
+            assert found is not None and found.interval is not None
+            covered[turns] += found.interval[0] <= 1 <= found.interval[1]
+    # 38 are expected; values of one series, whose turns are not known, cover fewer.
+    assert covered[(40,) * 8] >= 34 > 30 >= covered[()]
+
+
+def test_turns_of_both_sides_are_compared_in_their_order() -> None:
+    a, b = [1.0, 1, 2, 2, 2, 4], [3.0, 3, 3, 1, 8, 8]
+    found = difference(Sample(a, [2, 3, 1]), Sample(b, [3, 1, 2]))
+    assert found is not None and found.turn_ratios == (3, 0.5, 2)
+    for turns in ([], [6], [3, 3], [0, 4, 2]):
+        found = difference(Sample(a, [2, 3, 1]), Sample(b, turns))
+        assert found is not None and found.turn_ratios == ()
+    # A turn without values is not drawn.
+    assert Sample(a, [0, 6]).median_interval() == Sample(a, [6, 0]).median_interval()
+
+
 def test_a_long_series_has_the_interval_of_all_its_values(monkeypatch: pytest.MonkeyPatch) -> None:
     values = np.random.RandomState(3).lognormal(size=4000)
+    in_turns = np.concatenate([values[:2000], 1.2 * values[2000:]])
     every = Sample(values).drawn_medians(1).std()
+    of_turns = Sample(in_turns, [2000, 2000]).drawn_medians(1).std()
     monkeypatch.setattr(stats, "MAX_DRAWN", 500)
     assert Sample(values).drawn_medians(1).std() == pytest.approx(every, rel=0.15)
+    # Turns do not differ less when fewer values of them are drawn.
+    fewer = Sample(in_turns, [2000, 2000]).drawn_medians(1).std()
+    assert fewer == pytest.approx(of_turns, rel=0.15) and of_turns > 2 * every
 
 
 def test_a_million_values_have_all_statistics() -> None:
