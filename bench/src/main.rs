@@ -51,7 +51,7 @@ enum BenchCommand {
         skip: Vec<String>,
     },
     /// The table and the figures of the paper: three workloads, each as native ROS 2, in Python and
-    /// in wasm, in some 20 minutes; needs gleaner-player.
+    /// in wasm, in some 25 minutes; needs gleaner-player.
     Paper {
         #[command(flatten)]
         options: rtt::PaperOptions,
