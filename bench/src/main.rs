@@ -11,6 +11,7 @@ mod isolation;
 mod kernels;
 mod live;
 mod measure;
+mod native_rules;
 mod record;
 mod replay;
 mod rtt;
@@ -54,7 +55,7 @@ enum BenchCommand {
     /// in wasm, in some 25 minutes; needs gleaner-player.
     Paper {
         #[command(flatten)]
-        options: rtt::PaperOptions,
+        options: rtt::RttOptions,
     },
     /// Round trips from a sample to its answer, against a bare reader and programs without
     /// Gleaner; needs gleaner-player.
@@ -170,6 +171,8 @@ fn measure(command: &BenchCommand, args: &Args) -> Result<ExitCode, Failure> {
         results = resumed(results, &folder)?;
     } else {
         BenchResults::keep_previous(&folder)?;
+        // What is aborted in its first part can be resumed, too.
+        results.store(&folder)?;
     }
     let measured = measure::caught(|| run(command, quick, &mut results, &folder));
     results.is_complete = measured.is_ok();
@@ -207,8 +210,6 @@ fn run(
     folder: &Path,
 ) -> Result<(), Failure> {
     let mut save = |results: &BenchResults| results.store(folder);
-    // What is aborted can be resumed.
-    save(results)?;
     match command {
         BenchCommand::Rtt { options } => return rtt::measure(quick, options, results, &mut save),
         BenchCommand::Paper { options } => return rtt::paper(quick, options, results, &mut save),

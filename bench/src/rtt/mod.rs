@@ -72,9 +72,6 @@ pub struct RttOptions {
     pub resume: bool,
 }
 
-/// Options of a run of the paper, whose lengths are the defaults.
-pub type PaperOptions = RttOptions;
-
 impl RttOptions {
     /// Returns the options that affect what is measured.
     fn text(&self, bench: &str) -> String {
@@ -120,7 +117,7 @@ pub fn measure(
 /// As [`measure`].
 pub fn paper(
     quick: bool,
-    options: &PaperOptions,
+    options: &RttOptions,
     results: &mut BenchResults,
     save: Save<'_>,
 ) -> Result<(), Failure> {

@@ -17,7 +17,6 @@ use clap::Args;
 use gleaner_messages::transport::Clock;
 use gleaner_messages::{CdrWriter, Endian, FieldPath, HeaderStamp, ImageView, header_stamp};
 use gleaner_pixels::{Encoding, View, ops};
-use gleaner_sdk::kernels::mean::mean;
 use imu_fft::road::Road;
 use mio::{Events, Interest, Poll, Token};
 use rustdds::policy::{Durability, History, Reliability, ResourceLimits};
@@ -32,6 +31,7 @@ use signal_hook::consts::{SIGINT, SIGTERM};
 use super::ANSWERS;
 use super::workload::{BRAKE_MPS2, DARK_LUMA, IMU, Workload};
 use crate::answers::definitions;
+use crate::native_rules::{BRAKE_WINDOW_NS, FFT_WINDOW_S, REFRACTORY_NS, braking};
 
 /// Receive buffer of its sockets, as of the ingress.
 const BUFFER_BYTES: usize = 64 << 20;
@@ -41,14 +41,9 @@ const DEPTH: i32 = 16;
 
 /// As in `examples/imu-fft`.
 const IMU_DEPTH: usize = 4096;
-const WINDOW_S: f64 = 1.25;
 const ROUGH: f64 = 0.5;
 /// As in `bench/lambdas/imu-spectrum`.
 const ROUGH_SPECTRUM: f64 = 0.09;
-/// As in `examples/brake-dark`.
-const WINDOW_NS: i64 = 500_000_000;
-const FULL_NS: i64 = 450_000_000;
-const REFRACTORY_NS: i64 = 3_000_000_000;
 
 /// The work of a node.
 #[derive(Args, Clone, Copy)]
@@ -180,7 +175,7 @@ impl NodeLambda {
         let (axis, rules) = match options.workload {
             _ if options.bare => ("z", NodeRules::Bare),
             Workload::Empty | Workload::EmptyAwake | Workload::Detector => ("z", NodeRules::Bare),
-            Workload::ImuFft => ("z", NodeRules::ImuFft(Road::new(WINDOW_S))),
+            Workload::ImuFft => ("z", NodeRules::ImuFft(Road::new(FFT_WINDOW_S))),
             Workload::ImuSpectrum => {
                 let spectrum = RoadSpectrum::new().expect("the length is a power of two");
                 ("z", NodeRules::ImuSpectrum(spectrum))
@@ -249,10 +244,9 @@ fn oldest_first<'a>(
 
 /// Returns whether the window is full, and its mean is that of a car that brakes.
 fn is_braking(samples: &VecDeque<(i64, f64)>, now: i64) -> bool {
-    let window = samples.iter().filter(|(at_ns, _)| *at_ns > now - WINDOW_NS);
+    let window = samples.iter().filter(|(at_ns, _)| *at_ns > now - BRAKE_WINDOW_NS);
     let (at_ns, values) = oldest_first(window);
-    at_ns.first().is_some_and(|oldest| now - oldest >= FULL_NS)
-        && mean(&values).is_some_and(|mean| mean < BRAKE_MPS2)
+    braking(&at_ns, &values, now, BRAKE_MPS2).is_some()
 }
 
 /// Returns the mean luma of a `sensor_msgs/msg/Image`, as the host computes it for a lambda.

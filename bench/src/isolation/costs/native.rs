@@ -14,13 +14,9 @@ use gleaner_host::guest::{Guest, LambdaEngine, WakeOutcome};
 use gleaner_lambda::manifest::ConfigValue;
 use gleaner_lambda::{Fault, FaultKind};
 use gleaner_sdk::kernels::fft::SpectrumError;
-use gleaner_sdk::kernels::mean::mean;
 use imu_fft::road::{Road, Roughness};
 
-/// As in `examples/brake-dark`.
-const WINDOW_NS: i64 = 500_000_000;
-const FULL_NS: i64 = 450_000_000;
-const REFRACTORY_NS: i64 = 3_000_000_000;
+use crate::native_rules::{BRAKE_WINDOW_NS, REFRACTORY_NS, braking};
 
 /// A guest that is a native function.
 pub(super) struct NativeGuest {
@@ -91,10 +87,9 @@ impl NativeGuest {
             }
             Some(NativeLambda::BrakeDark { imu, forward, brake_mps2, dark_luma, last_ns }) => {
                 let now = self.session.now_ns();
-                let window = imu.column_since(forward, now - WINDOW_NS)?;
-                let is_full = window.at_ns.first().is_some_and(|oldest| now - oldest >= FULL_NS);
+                let window = imu.column_since(forward, now - BRAKE_WINDOW_NS)?;
                 let is_rested = now - *last_ns >= REFRACTORY_NS;
-                let braking = mean(&window.values).filter(|mean| is_full && mean < brake_mps2);
+                let braking = braking(&window.at_ns, &window.values, now, *brake_mps2);
                 let Some(mean) = braking.filter(|_| is_rested) else { return Ok(()) };
                 let luma = sample.as_frame()?.mean_luma(None)?;
                 if luma < *dark_luma {

@@ -13,12 +13,11 @@ use imu_fft::road::Road;
 use super::drives::{self, CAMERA, IMU};
 use super::sides::{WakeSide, WakeTurn};
 use crate::measure::{Twin, shuffled};
+use crate::native_rules::FFT_WINDOW_S;
 use crate::rtt::Workload;
 
 /// Wakes without a spectrum that are kept of a turn: all of them would be most of the results.
 const OTHER_WAKES: usize = 1_000;
-/// Length of a window of `examples/imu-fft` in seconds.
-const WINDOW_S: f64 = 1.25;
 /// The part of a drive that is replayed to know what all but the wakes takes.
 const BEGIN: [&str; 2] = ["--to", "0.05"];
 
@@ -170,7 +169,7 @@ impl SideValues {
 
 /// Returns 0 for each wake of `examples/imu-fft` with a spectrum, and 1 for the others.
 fn has_no_spectrum(decisions: &[Decision]) -> Vec<usize> {
-    let mut road = Road::new(WINDOW_S);
+    let mut road = Road::new(FFT_WINDOW_S);
     let has_none = |decision: &Decision| {
         let window = road.note(decision.at_ns).expect("the lambda had the same stamps");
         usize::from(window.is_none())
